@@ -1,0 +1,98 @@
+"""jaxguide: one differentiable line from a problem statement to flown dispersions.
+
+Names are imported when first used: `import jaxguide` costs next to nothing, and the command line
+can set the environment before JAX is loaded.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxguide import problems as problems
+    from jaxguide.certificate import Certificate as Certificate
+    from jaxguide.certificate import certify as certify
+    from jaxguide.flight.integrators import Adaptive as Adaptive
+    from jaxguide.flight.integrators import RungeKutta4 as RungeKutta4
+    from jaxguide.flight.mission import Mission as Mission
+    from jaxguide.flight.simulate import Flight as Flight
+    from jaxguide.flight.simulate import simulate as simulate
+    from jaxguide.laws.holds import History as History
+    from jaxguide.laws.holds import HoldControl as HoldControl
+    from jaxguide.laws.holds import HoldDeviation as HoldDeviation
+    from jaxguide.laws.law import Command as Command
+    from jaxguide.laws.law import Law as Law
+    from jaxguide.laws.law import OpenLoop as OpenLoop
+    from jaxguide.laws.neighboring import NeighboringOptimal as NeighboringOptimal
+    from jaxguide.montecarlo.covariance import linear_covariance as linear_covariance
+    from jaxguide.montecarlo.dispersions import MultivariateNormal as MultivariateNormal
+    from jaxguide.montecarlo.dispersions import Normal as Normal
+    from jaxguide.montecarlo.dispersions import Uniform as Uniform
+    from jaxguide.montecarlo.rollouts import rollouts as rollouts
+    from jaxguide.montecarlo.sweep import sweep as sweep
+    from jaxguide.neighboring.gains import GainSchedule as GainSchedule
+    from jaxguide.neighboring.gains import gain_schedule as gain_schedule
+    from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
+    from jaxguide.neighboring.linearization import linearize as linearize
+    from jaxguide.nominal.shooting import Shooting as Shooting
+    from jaxguide.problem import Free as Free
+    from jaxguide.problem import Problem as Problem
+    from jaxguide.solving import solve as solve
+    from jaxguide.trajectory import Extremal as Extremal
+    from jaxguide.trajectory import Trajectory as Trajectory
+    from jaxguide.trig import sincos as sincos
+    from jaxguide.types import RESULTS as RESULTS
+    from jaxguide.types import SolveError as SolveError
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Adaptive": "flight.integrators",
+    "Certificate": "certificate",
+    "Command": "laws.law",
+    "Extremal": "trajectory",
+    "Flight": "flight.simulate",
+    "Free": "problem",
+    "GainSchedule": "neighboring.gains",
+    "History": "laws.holds",
+    "HoldControl": "laws.holds",
+    "HoldDeviation": "laws.holds",
+    "Law": "laws.law",
+    "LinearTPBVP": "neighboring.linearization",
+    "Mission": "flight.mission",
+    "MultivariateNormal": "montecarlo.dispersions",
+    "NeighboringOptimal": "laws.neighboring",
+    "Normal": "montecarlo.dispersions",
+    "OpenLoop": "laws.law",
+    "Problem": "problem",
+    "RESULTS": "types",
+    "RungeKutta4": "flight.integrators",
+    "Shooting": "nominal.shooting",
+    "SolveError": "types",
+    "Trajectory": "trajectory",
+    "Uniform": "montecarlo.dispersions",
+    "certify": "certificate",
+    "gain_schedule": "neighboring.gains",
+    "linear_covariance": "montecarlo.covariance",
+    "linearize": "neighboring.linearization",
+    "rollouts": "montecarlo.rollouts",
+    "simulate": "flight.simulate",
+    "sincos": "trig",
+    "solve": "solving",
+    "sweep": "montecarlo.sweep",
+}
+_MODULES = ("plotting", "problems", "reproduce")
+
+
+def __getattr__(name: str) -> object:
+    if name in _HOME:
+        value = getattr(importlib.import_module(f"jaxguide.{_HOME[name]}"), name)
+    elif name in _MODULES:
+        value = importlib.import_module(f"jaxguide.{name}")
+    else:
+        raise AttributeError(f"module 'jaxguide' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME, *_MODULES])

@@ -1,0 +1,251 @@
+"""The Certificate: how good an extremal is, each necessary condition as a number with its bound."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxguide.nominal.conditions import endpoint_lagrangian
+from jaxguide.problem import Problem, bounds_of, hamiltonian, initial_values, is_free
+from jaxguide.spectral import interpolation_matrix, nodes_lg, nodes_lgl
+from jaxguide.trajectory import Extremal
+
+
+class Certificate(eqx.Module):
+    """Rows of checks. `passed` is a bool array; printed, a table that names the worst place."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    labels: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    value: Float[Array, " row"]
+    tolerance: Float[Array, " row"]
+    time: Float[Array, " row"]
+    component: Array
+
+    @property
+    def passed(self) -> Bool[Array, " row"]:
+        return self.value <= self.tolerance  # NaN fails
+
+    def __str__(self) -> str:
+        width = max(len(name) for name in self.names)
+        lines = []
+        rows = zip(
+            self.names,
+            self.labels,
+            np.asarray(self.value),
+            np.asarray(self.tolerance),
+            np.asarray(self.time),
+            np.asarray(self.component),
+            np.asarray(self.passed),
+            strict=True,
+        )
+        for name, labels, value, tolerance, time, component, passed in rows:
+            where = f"{labels[int(component) % len(labels)]} at t = {time:.6g}" if labels else ""
+            verdict = "ok   " if passed else "FAILS"
+            lines.append(f"{verdict} {name:{width}s} {value:9.2e} <= {tolerance:7.1e}  {where}")
+        return "\n".join(lines)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The table as plain data."""
+        return [
+            {
+                "check": name,
+                "value": float(v),
+                "tolerance": float(tol),
+                "time": float(t),
+                "where": labels[int(c) % len(labels)] if labels else "",
+                "passed": bool(p),
+            }
+            for name, labels, v, tol, t, c, p in zip(
+                self.names, self.labels, self.value, self.tolerance, self.time, self.component,
+                self.passed, strict=True,
+            )
+        ]  # fmt: skip
+
+
+class _Rows:
+    """Collects rows while the checks are traced."""
+
+    def __init__(self):
+        self.names, self.labels = [], []
+        self.value, self.tolerance, self.time, self.component = [], [], [], []
+
+    def add(self, name: str, labels: Any, values: Array, times: Array, tolerance: float) -> None:
+        """`values` (k, c): errors of components named by `labels` at `times` (k,)."""
+        if values.size == 0:
+            return
+        values = jnp.abs(values)
+        flat = jnp.where(jnp.isnan(values), jnp.inf, values)
+        worst = jnp.argmax(flat)
+        node, component = worst // values.shape[1], worst % values.shape[1]
+        self.names.append(name)
+        self.labels.append(tuple(labels))
+        self.value.append(values[node, component])
+        self.tolerance.append(jnp.asarray(tolerance, values.dtype))
+        self.time.append(times[node])
+        self.component.append(component)
+
+    def add_signed(
+        self, name: str, labels: Any, value: Array, time: Array, tolerance: float
+    ) -> None:
+        """One signed number that must not exceed `tolerance`."""
+        self.names.append(name)
+        self.labels.append(tuple(labels))
+        self.value.append(value)
+        self.tolerance.append(jnp.asarray(tolerance, value.dtype))
+        self.time.append(time)
+        self.component.append(jnp.zeros((), jnp.int64 if value.dtype == jnp.float64 else jnp.int32))
+
+    def done(self) -> Certificate:
+        stack = jnp.stack
+        return Certificate(
+            tuple(self.names),
+            tuple(self.labels),
+            stack(self.value),
+            stack(self.tolerance),
+            stack(self.time),
+            stack(self.component),
+        )
+
+
+def certify(extremal: Extremal, costly: bool = False) -> Certificate:
+    """Checks an extremal against the conditions it should meet, independently of its solver.
+
+    **Arguments:** `costly`: also fly the interpolated control with an adaptive integrator
+    (Diffrax, 1e-11) and compare with the extremal's own states. Errors are relative to the size of
+    what is compared, so the tolerances (1e-8 for most) hold in any units.
+
+    **Source:** 2002 paper eqs (2)-(9); review, section 4.
+    """
+    return (_full if costly else _quick)(extremal)
+
+
+def _checks(extremal: Extremal, costly: bool) -> Certificate:
+    problem, t = extremal.problem, extremal.t
+    x, u, costate = extremal.x, extremal.u, extremal.costate
+    rows = _Rows()
+    states = problem.state_names
+    costates = tuple(f"costate of {name}" for name in states)
+    span = jnp.max(jnp.abs(x), axis=0) + 1e-300
+    lam_span = jnp.max(jnp.abs(costate)) + jnp.abs(_cost_scale(extremal)) + 1e-300
+
+    if costly:
+        flown = _propagate(extremal)
+        rows.add(
+            "propagated state", states, (flown - x) / (1e-3 + span)[None], t, 1e-8
+        )
+
+    # Canonical equations, eqs (2) and (6), in integral form on Gauss points between the nodes.
+    gauss, weights = (jnp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
+    breaks = extremal.breaks
+    half = jnp.diff(breaks) / 2
+    mid = (breaks[1:] + breaks[:-1]) / 2
+    times = mid[:, None] + half[:, None] * gauss[None, :]
+    to_gauss = interpolation_matrix(extremal.reference_nodes, gauss)
+    at = lambda v: jnp.einsum("gp,spk->sgk", to_gauss, extremal.by_segment(v))
+    gx, gu, glam = at(x), at(u), at(costate)
+    over = lambda f: jax.vmap(jax.vmap(lambda t, x, u, c: f(problem, t, x, u, c)))
+    f = over(lambda p, t, x, u, c: p.dynamics(t, x, u))(times, gx, gu, glam)
+    h_x = over(jax.grad(hamiltonian, argnums=2))(times, gx, gu, glam)
+    quad = lambda v: half[:, None] * jnp.einsum("g,sgk->sk", weights, v)
+    step = extremal.reference_nodes.shape[0] - 1
+    ends = lambda v: v[step::step] - v[:-1:step]
+    rows.add("state equation", states, (ends(x) - quad(f)) / (1e-3 + span)[None], breaks[1:], 1e-9)
+    rows.add("costate equation", costates, (ends(costate) + quad(h_x)) / lam_span, breaks[1:], 1e-9)
+
+    # Boundary data and transversality, eqs (3), (8), (9).
+    x0, xf, t0, tf = x[0], x[-1], t[0], t[-1]
+    e = problem.endpoint_constraints(x0, xf, t0, tf)
+    lo, hi = bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)
+    miss = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
+    labels = [f"constraint {i}" for i in range(e.shape[0])]
+    rows.add("endpoint constraints", labels, miss[None], tf[None], 1e-9)
+    given, free = initial_values(problem, x.dtype)
+    g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))(
+        problem, extremal.multipliers.endpoint, x0, xf, t0, tf
+    )
+    free_mask = jnp.asarray(free)
+    rows.add(
+        "initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], 1e-9
+    )
+    rows.add("transversality, end", costates, ((costate[-1] - g[1]) / lam_span)[None], tf[None], 1e-9)
+    if any(free):
+        gap = jnp.where(free_mask, costate[0] + g[0], 0.0) / lam_span
+        rows.add("transversality, start", costates, gap[None], t0[None], 1e-9)
+
+    # The Hamiltonian: stationary in u, and dH/dt = H_t along the extremal.
+    h_node = jax.vmap(hamiltonian, in_axes=(None, 0, 0, 0, 0))(problem, t, x, u, costate)
+    h_scale = 1e-3 * lam_span + jnp.max(jnp.abs(h_node))
+    if is_free(problem.final_time):
+        rows.add("H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], 1e-9)
+    h_t = over(jax.grad(hamiltonian, argnums=1))(times, gx, gu, glam)
+    drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
+    gap = (h_node[step::step] - h_node[0] - drift) / h_scale
+    rows.add("Hamiltonian rate", ("H",), gap[:, None], breaks[1:], 1e-9)
+    h_u = jax.vmap(jax.grad(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
+        problem, t, x, u, costate
+    )
+    rows.add("stationarity H_u", problem.control_names, h_u / h_scale, t, 1e-9)
+    h_uu = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
+        problem, t, x, u, costate
+    )
+    least = h_uu[:, 0, 0] if problem.m == 1 else jnp.linalg.eigvalsh(h_uu)[:, 0]
+    # Legendre-Clebsch: the row is minus the least eigenvalue, so that <= 0 is what is wanted.
+    worst = jnp.argmin(least)
+    rows.add_signed("Legendre-Clebsch", ("-min eig H_uu",), -least[worst], t[worst], 0.0)
+
+    for name, labels, values, bounds in (
+        ("state bounds", states, x, problem.state_bounds),
+        ("control bounds", problem.control_names, u, problem.control_bounds),
+        ("path constraints", None, jax.vmap(problem.path_constraints)(t, x, u), problem.path_bounds),
+    ):
+        lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
+        over_by = jnp.maximum(lo[None] - values, 0.0) + jnp.maximum(values - hi[None], 0.0)
+        labels = labels or [f"path {i}" for i in range(values.shape[1])]
+        rows.add(name, labels, over_by, t, 1e-9)
+
+    # Spectral tail: the last two Legendre coefficients of each segment's polynomial.
+    p = extremal.reference_nodes.shape[0]
+    vandermonde = np.polynomial.legendre.legvander(nodes_lgl(p)[0], p - 1)
+    inverse = jnp.asarray(np.linalg.inv(vandermonde), t.dtype)[-2:]
+    tail = lambda v, s: jnp.max(
+        jnp.abs(jnp.einsum("rp,spk->srk", inverse, extremal.by_segment(v))), axis=1
+    ) / (s if jnp.ndim(s) else s * jnp.ones(v.shape[1], v.dtype))[None]
+    rows.add("spectral tail, state", states, tail(x, 1e-3 + span), breaks[1:], 1e-9)
+    rows.add("spectral tail, costate", costates, tail(costate, lam_span), breaks[1:], 1e-9)
+    return rows.done()
+
+
+def _cost_scale(extremal: Extremal) -> Array:
+    problem = extremal.problem
+    g = jax.grad(problem.endpoint_cost, argnums=1)(
+        extremal.x[0], extremal.x[-1], extremal.t[0], extremal.t[-1]
+    )
+    return jnp.max(jnp.abs(g))
+
+
+def _propagate(extremal: Extremal) -> Array:
+    """States flown from x(t0) with the interpolated control, at the nodes."""
+    problem: Problem = extremal.problem
+    rate = lambda t, x, args: problem.dynamics(t, x, extremal.interpolate(extremal.u, t))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(rate),
+        diffrax.Dopri8(),
+        extremal.t[0],
+        extremal.t[-1],
+        None,
+        extremal.x[0],
+        stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
+        saveat=diffrax.SaveAt(ts=extremal.t),
+        max_steps=16384,
+        throw=False,
+    )
+    assert solution.ys is not None
+    return solution.ys
+
+
+_quick = eqx.filter_jit(lambda extremal: _checks(extremal, False))
+_full = eqx.filter_jit(lambda extremal: _checks(extremal, True))

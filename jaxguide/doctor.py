@@ -1,0 +1,145 @@
+"""Is this installation fit for use? Versions, devices, precision, cache, and a known fault of JAX.
+
+Host-side, and imports nothing of jaxguide: it must run when the rest does not.
+"""
+
+import importlib.metadata
+import os
+import platform
+from typing import Any
+
+import numpy as np
+
+FAULTY_JAX = ("0.10.2",)  # jax issue 39103
+PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "optax", "numpy")
+# Thresholds were seen at 16,385 rows (float64) and 32,769 rows (float32); the fault comes and goes
+# with the row count (0 bad rows at 100,000 x 6), hence several.
+CANARY_ROWS = (16_384, 16_385, 20_000, 32_769, 50_000)
+CANARY_COLUMNS = (3, 6)
+
+
+def canary() -> int:
+    """Number of wrong rows in jitted mat-vecs followed by a reduction, vmapped over many rows.
+
+    Some JAX releases return wrong numbers here without a word. Checked in float32, and in float64
+    if it is enabled, against NumPy.
+
+    **Returns:** 0 on a sound JAX.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    dtypes = [np.float32] + ([np.float64] if _x64() else [])
+    wrong = 0
+    for dtype in dtypes:
+        for d in CANARY_COLUMNS:
+            m = jnp.eye(d, dtype=dtype)
+            f = jax.jit(jax.vmap(lambda r, m=m: jnp.sum((m @ r) ** 2)))
+            for rows in CANARY_ROWS:
+                x = np.zeros((rows, d), dtype)
+                x[:, 0] = np.arange(rows)
+                want = np.sum(x.astype(float) ** 2, axis=1)
+                got = np.asarray(f(jnp.asarray(x)), float)
+                # A sum of squares without cancellation: a few eps, 1e-6 is 8 eps of float32.
+                # Negated, so that NaN counts as wrong.
+                wrong += int(np.sum(~(np.abs(got - want) <= 1e-6 * want)))
+    return wrong
+
+
+def report() -> dict[str, dict[str, Any]]:
+    """Everything checked, by name: `{"value": ..., "ok": bool, "remedy": str}`.
+
+    `remedy` is empty where `ok` holds.
+    """
+    import jax
+
+    checks: dict[str, dict[str, Any]] = {}
+
+    def check(name: str, value: Any, ok: bool, remedy: str) -> None:
+        checks[name] = {"value": value, "ok": bool(ok), "remedy": "" if ok else remedy}
+
+    wanted = _requirements()
+    python = platform.python_version()
+    check("python", python, _meets(python, wanted["python"]), f"use Python {wanted['python']}")
+    for name in PACKAGES:
+        try:
+            version = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            version = None
+        needed = f"{name}{wanted.get(name, '')}"
+        ok = version is not None and _meets(version, wanted.get(name, ""))
+        check(name, version, ok, f"pip install '{needed}'")
+
+    check(
+        "faulty jax",
+        jax.__version__,
+        jax.__version__ not in FAULTY_JAX,
+        "this release gives wrong numbers on CPU (jax issue 39103): pip install 'jax!=0.10.2'",
+    )
+    wrong = canary()
+    check(
+        "canary",
+        f"{wrong} wrong rows",
+        wrong == 0,
+        "this JAX gives wrong numbers for batched mat-vecs: install another release of jax",
+    )
+    check(
+        "devices",
+        [f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()],
+        len(jax.devices()) > 0,
+        "no device found: see the installation notes of JAX for your accelerator",
+    )
+    check(
+        "x64",
+        _x64(),
+        _x64(),
+        "nominal solves need float64: jax.config.update('jax_enable_x64', True), "
+        "or set JAX_ENABLE_X64=1",
+    )
+    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    check(
+        "compilation cache",
+        cache,
+        cache is not None and _writable(cache),
+        "every process compiles anew: set JAX_COMPILATION_CACHE_DIR to a folder you may write",
+    )
+    check("cores", os.cpu_count(), True, "")
+    return checks
+
+
+def _x64() -> bool:
+    import jax
+
+    return bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _requirements() -> dict[str, str]:
+    """Version ranges that the installed package asks for; none when it is not installed."""
+    try:
+        python = importlib.metadata.metadata("jaxguide")["Requires-Python"]
+    except importlib.metadata.PackageNotFoundError:
+        return {"python": ""}
+    from packaging.requirements import Requirement
+
+    wanted = {"python": python}
+    for line in importlib.metadata.requires("jaxguide") or ():
+        requirement = Requirement(line)
+        if requirement.marker is None:
+            wanted[requirement.name] = str(requirement.specifier)
+    return wanted
+
+
+def _meets(version: str, specifier: str) -> bool:
+    from packaging.specifiers import SpecifierSet
+
+    return SpecifierSet(specifier).contains(version, prereleases=True)
+
+
+def _writable(folder: str) -> bool:
+    """A cache folder may be remote (`gs://...`), or absent until the first compilation."""
+    if "://" in folder:
+        return True
+    folder = os.path.abspath(folder)
+    while not os.path.exists(folder):
+        folder = os.path.dirname(folder)
+    return os.path.isdir(folder) and os.access(folder, os.W_OK)

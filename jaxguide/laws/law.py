@@ -1,0 +1,90 @@
+"""What a guidance law is: a measurement in, a command over the next sample out."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxguide.types import RESULTS
+
+
+class SampleGrid(eqx.Module):
+    """Where a fixed-step flight will ask: sample times and the stage times within each sample."""
+
+    times: Float[Array, " sample"]
+    stages: Float[Array, "sample stage"]
+
+
+class Command(eqx.Module):
+    """A control over the next sample, its nominal and its deviation kept apart."""
+
+    result: eqx.AbstractVar[RESULTS]
+    saturated: eqx.AbstractVar[Bool[Array, ""]]
+
+    @abc.abstractmethod
+    def nominal(self, t: Any) -> Float[Array, " m"]:
+        """The nominal control at `t`."""
+
+    @abc.abstractmethod
+    def deviation(self, t: Any) -> Float[Array, " m"]:
+        """What the law adds to it at `t`."""
+
+    def __call__(self, t: Any) -> Float[Array, " m"]:
+        return self.nominal(t) + self.deviation(t)
+
+    def nominal_on(self, times: Float[Array, " stage"]) -> Float[Array, "stage m"]:
+        """`nominal` at the stage times of the sample; laws prepared on a grid look it up."""
+        return jax.vmap(self.nominal)(times)
+
+    def deviation_on(self, times: Float[Array, " stage"]) -> Float[Array, "stage m"]:
+        """`deviation` at the stage times of the sample."""
+        return jax.vmap(self.deviation)(times)
+
+
+class Law(eqx.Module):
+    """A guidance law. `memory` is a pytree of whatever it must remember between samples."""
+
+    @abc.abstractmethod
+    def start(self, x0: Float[Array, " n"]) -> Any:
+        """Memory before the first sample."""
+
+    @abc.abstractmethod
+    def __call__(self, t_k: Any, x: Float[Array, " n"], memory: Any) -> tuple[Command, Any]:
+        """The command from `t_k` on, given the measured state; and the new memory."""
+
+    def prepared(self, grid: SampleGrid) -> "Law | None":
+        """The law with a leading sample axis on every leaf, its time-dependent work done.
+
+        All flights of a batch share their sample times, so gains and nominal are worth looking up
+        once. None (the default): nothing to prepare.
+        """
+        return None
+
+
+class OpenLoop(Law):
+    """Flies the nominal control and looks at nothing."""
+
+    extremal: Any
+
+    def start(self, x0: Array) -> None:
+        return None
+
+    def __call__(self, t_k: Any, x: Array, memory: None) -> tuple[Command, None]:
+        return NominalCommand(self.extremal, RESULTS.successful, jnp.array(False)), None
+
+
+class NominalCommand(Command):
+    """The nominal control with no deviation."""
+
+    extremal: Any
+    result: RESULTS
+    saturated: Bool[Array, ""]
+
+    def nominal(self, t: Any) -> Float[Array, " m"]:
+        return self.extremal(t).u
+
+    def deviation(self, t: Any) -> Float[Array, " m"]:
+        return jnp.zeros_like(self.extremal.u[0])

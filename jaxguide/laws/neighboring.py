@@ -1,0 +1,142 @@
+"""Neighbouring optimal control: du = K dx, sampled (2002 paper, eq. 49 and section 4)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxguide.laws.law import Command, Law, SampleGrid
+from jaxguide.neighboring.gains import GainSchedule
+from jaxguide.types import RESULTS, is_traced
+
+
+class NeighboringOptimal(Law):
+    """u = u*(t) + du(t), du from the deviation dx = x - x*(t_k) measured at the sample.
+
+    The command carries the whole open-loop history du(t) of eq. (49) up to the final time; a hold
+    decides how much of it is flown.
+
+    **Arguments:** `schedule`: gains; `cap`: bound on |du| per control (inf: none); `scale`: a
+    factor on every gain.
+    """
+
+    schedule: GainSchedule
+    cap: Any = np.inf
+    scale: Any = 1.0
+
+    def __check_init__(self):
+        if not is_traced(self.cap) and not np.all(np.asarray(self.cap) > 0):
+            raise ValueError(f"NeighboringOptimal: cap is {self.cap}; give a positive bound on |du|.")
+
+    def start(self, x0: Float[Array, " n"]) -> None:
+        return None
+
+    def __call__(
+        self, t_k: Any, x: Float[Array, " n"], memory: None
+    ) -> tuple["NeighboringCommand", None]:
+        schedule = self.schedule
+        t_k = jnp.asarray(t_k, schedule.times.dtype)
+        dx = x - schedule.extremal(t_k).x.astype(x.dtype)
+        inside = (t_k >= schedule.extremal.t[0]) & (t_k < schedule.extremal.t[-1])
+        result = RESULTS.where(inside, RESULTS.successful, RESULTS.outside_horizon)
+        _, saturated = _capped(self._gain(t_k, t_k).astype(x.dtype) @ dx, self.cap)
+        return NeighboringCommand(self, t_k, dx, result, saturated), None
+
+    def _gain(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
+        return self.scale * self.schedule.history(t_k, t)
+
+    def prepared(self, grid: SampleGrid) -> "PreparedNeighboring":
+        extremal = self.schedule.extremal
+        # Past the last gain (samples beyond the end of the flight have no length) hold it.
+        times = jnp.minimum(grid.times, self.schedule.times[-1])
+        stages = grid.stages
+        K = jax.vmap(self.schedule)(times)
+        maps = jax.vmap(lambda t_k, ts: jax.vmap(lambda t: self._gain(t_k, t))(ts))
+        ends = jnp.maximum(stages, times[:, None])
+        return PreparedNeighboring(
+            extremal(grid.times).x,
+            self.scale * K,
+            jax.vmap(lambda ts: extremal(ts).u)(stages),
+            maps(times, ends),
+            jnp.broadcast_to(jnp.asarray(self.cap, K.dtype), (grid.times.shape[0],)),
+            grid.times < extremal.t[-1],
+        )
+
+
+class NeighboringCommand(Command):
+    """The history du(t) = K(t; t_k) dx, capped."""
+
+    law: NeighboringOptimal
+    t_k: Float[Array, ""]
+    dx: Float[Array, " n"]
+    result: RESULTS
+    saturated: Bool[Array, ""]
+
+    def nominal(self, t: Any) -> Float[Array, " m"]:
+        return self.law.schedule.extremal(t).u.astype(self.dx.dtype)
+
+    def deviation(self, t: Any) -> Float[Array, " m"]:
+        gain = self.law._gain(self.t_k, jnp.asarray(t, self.t_k.dtype)).astype(self.dx.dtype)
+        return _capped(gain @ self.dx, self.law.cap)[0]
+
+
+class PreparedNeighboring(Law):
+    """One sample of `NeighboringOptimal`, its gains looked up; leaves gain a sample axis when
+    stacked by `prepared`."""
+
+    x_nominal: Float[Array, "*k n"]
+    K: Float[Array, "*k m n"]
+    u_nominal: Float[Array, "*k stage m"]
+    maps: Float[Array, "*k stage m n"]
+    cap: Float[Array, "*k"]
+    inside: Bool[Array, "*k"]
+
+    def start(self, x0: Array) -> None:
+        return None
+
+    def __call__(
+        self, t_k: Any, x: Float[Array, " n"], memory: None
+    ) -> tuple["PreparedCommand", None]:
+        dx = [x[i] - self.x_nominal[i] for i in range(x.shape[0])]
+        du = _product(self.K, dx)
+        du, saturated = _capped(du, self.cap)
+        result = RESULTS.where(self.inside, RESULTS.successful, RESULTS.outside_horizon)
+        return PreparedCommand(self, jnp.stack(dx), du, result, saturated), None
+
+
+class PreparedCommand(Command):
+    """As NeighboringCommand, at the stage times it was prepared for."""
+
+    law: PreparedNeighboring
+    dx: Float[Array, " n"]
+    at_sample: Float[Array, " m"]
+    result: RESULTS
+    saturated: Bool[Array, ""]
+
+    def nominal(self, t: Any) -> Float[Array, " m"]:
+        return self.law.u_nominal[0]
+
+    def deviation(self, t: Any) -> Float[Array, " m"]:
+        return self.at_sample
+
+    def nominal_on(self, times: Array) -> Float[Array, "stage m"]:
+        return self.law.u_nominal
+
+    def deviation_on(self, times: Array) -> Float[Array, "stage m"]:
+        dx = [self.dx[i] for i in range(self.dx.shape[0])]
+        rows = [_product(self.law.maps[j], dx) for j in range(self.law.maps.shape[0])]
+        return _capped(jnp.stack(rows), self.law.cap)[0]
+
+
+def _product(K: Float[Array, "m n"], dx: list[Array]) -> Float[Array, " m"]:
+    """K dx by multiplications and additions: under `vmap` a dot over n lanes is slower."""
+    rows = [sum(K[j, i] * dx[i] for i in range(len(dx))) for j in range(K.shape[0])]
+    return jnp.stack(rows)
+
+
+def _capped(du: Array, cap: Any) -> tuple[Array, Bool[Array, ""]]:
+    cap = jnp.asarray(cap, du.dtype)
+    limited = jnp.clip(du, -cap, cap)
+    return limited, jnp.any(jnp.abs(du) > cap)

@@ -1,0 +1,36 @@
+"""Linear covariance of a closed loop: what the dispersions do to first order."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.flight.mission import Mission
+from jaxguide.flight.simulate import simulate
+from jaxguide.montecarlo.dispersions import Distribution
+from jaxguide.montecarlo.rollouts import apply, draw
+
+
+def linear_covariance(
+    mission: Mission, dispersions: dict[str, Distribution]
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Final state of the undispersed flight and the covariance of the final state about it.
+
+    The final state's Jacobian with respect to every dispersed quantity, through the same gains,
+    holds and integrator as the flights, sandwiches their covariance. Sensor noise is not included.
+
+    **Error:** first order in the dispersions; a sweep beside it shows what is left.
+    """
+    shapes = jax.eval_shape(lambda: draw(mission, dispersions, jax.random.key(0)))
+    zeros = {path: jnp.zeros(s.shape, s.dtype) for path, s in shapes.items()}
+
+    def end(draws: dict[str, Array]) -> Array:
+        return simulate(apply(mission, draws), jax.random.key(0), "ends").final_state
+
+    jacobians = jax.jacfwd(end)(zeros)
+    final = end(zeros)
+    n = final.shape[0]
+    total = jnp.zeros((n, n), final.dtype)
+    for path, jacobian in jacobians.items():
+        flat = jacobian.reshape(n, -1)
+        total = total + flat @ dispersions[path].covariance(flat.shape[1], final.dtype) @ flat.T
+    return final, total

@@ -1,0 +1,99 @@
+"""Distributions of the deviation of any leaf of a Mission."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxguide.types import is_traced
+
+
+class Distribution(eqx.Module):
+    """Abstract: draws deviations of one leaf."""
+
+    @abc.abstractmethod
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        """One draw of the given shape."""
+
+    @abc.abstractmethod
+    def covariance(self, size: int, dtype: Any) -> Array:
+        """Covariance (size, size) of the flattened draw."""
+
+
+class Normal(Distribution):
+    """Independent normal deviations; `std` and `mean` broadcast to the leaf."""
+
+    std: Any
+    mean: Any = 0.0
+
+    def __check_init__(self):
+        if not is_traced(self.std) and not np.all(np.asarray(self.std) >= 0):
+            raise ValueError(f"Normal: std is {self.std}; give numbers >= 0.")
+
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        std, mean = _fit(self.std, shape, dtype, "std"), _fit(self.mean, shape, dtype, "mean")
+        return mean + std * jax.random.normal(key, shape, dtype)
+
+    def covariance(self, size: int, dtype: Any) -> Array:
+        return jnp.diag(_fit(self.std, (size,), dtype, "std") ** 2)
+
+
+class Uniform(Distribution):
+    """Independent uniform deviations on [lo, hi]."""
+
+    lo: Any
+    hi: Any
+
+    def __check_init__(self):
+        if not is_traced((self.lo, self.hi)) and not np.all(np.asarray(self.lo) <= self.hi):
+            raise ValueError(f"Uniform: lo={self.lo} lies above hi={self.hi}; exchange them.")
+
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        lo, hi = _fit(self.lo, shape, dtype, "lo"), _fit(self.hi, shape, dtype, "hi")
+        return lo + (hi - lo) * jax.random.uniform(key, shape, dtype)
+
+    def covariance(self, size: int, dtype: Any) -> Array:
+        width = _fit(self.hi, (size,), dtype, "hi") - _fit(self.lo, (size,), dtype, "lo")
+        return jnp.diag(width**2 / 12)
+
+
+class MultivariateNormal(Distribution):
+    """Correlated normal deviations of a vector leaf, from their covariance (n, n)."""
+
+    cov: Any
+    mean: Any = 0.0
+
+    def __check_init__(self):
+        if is_traced(self.cov):
+            return
+        cov = np.asarray(self.cov, float)
+        if cov.ndim != 2 or cov.shape[0] != cov.shape[1] or not np.allclose(cov, cov.T):
+            raise ValueError(f"MultivariateNormal: cov must be square and symmetric, got\n{cov}.")
+        if np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max():
+            raise ValueError(f"MultivariateNormal: cov has a negative eigenvalue:\n{cov}.")
+
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        # The symmetric square root also serves a singular covariance.
+        cov = jnp.asarray(self.cov, dtype)
+        if shape != (cov.shape[0],):
+            raise ValueError(
+                f"MultivariateNormal: cov is {cov.shape}, but the leaf has shape {shape}."
+            )
+        values, vectors = jnp.linalg.eigh(cov)
+        root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
+        return _fit(self.mean, shape, dtype, "mean") + root @ jax.random.normal(key, shape, dtype)
+
+    def covariance(self, size: int, dtype: Any) -> Array:
+        return jnp.asarray(self.cov, dtype)
+
+
+def _fit(value: Any, shape: tuple[int, ...], dtype: Any, name: str) -> Array:
+    value = jnp.asarray(value, dtype)
+    try:
+        return jnp.broadcast_to(value, shape)
+    except ValueError as e:
+        raise ValueError(f"{name} of shape {value.shape} does not fit a leaf of {shape}.") from e

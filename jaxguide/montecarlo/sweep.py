@@ -1,0 +1,174 @@
+"""`jg.sweep`: many dispersed flights in fixed tiles, and their statistics. Host only."""
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxguide.flight.mission import Mission
+from jaxguide.flight.simulate import simulate
+from jaxguide.montecarlo.covariance import linear_covariance
+from jaxguide.montecarlo.dispersions import Distribution
+from jaxguide.montecarlo.rollouts import apply, draw
+from jaxguide.montecarlo.statistics import summarise, wilson_bounds
+from jaxguide.types import RESULTS
+
+if TYPE_CHECKING:
+    import xarray
+
+TILE = 2048  # lanes flown together: fixed, so that a case has the same bits in any sweep
+
+
+def sweep(
+    mission: Mission,
+    dispersions: dict[str, Distribution],
+    cases: int,
+    seed: int,
+    *,
+    store: Any = None,
+    scheduler: Any = None,
+    dtype: str | None = None,
+    tile: int = TILE,
+    progress: Any = None,
+) -> "xarray.Dataset":
+    """Flies `cases` dispersed missions and returns them as an xarray Dataset.
+
+    Case k depends on (seed, k) alone. Cases are flown in fixed tiles of `tile` lanes, each in its
+    own place of its tile, so that the same case gives the same bits whatever `cases` is. A failed
+    case is a row with its reason, never an exception.
+
+    **Arguments:** `dispersions`: path -> distribution; `dtype`: "float64" or "float32" (default
+    the mission's own); `progress`: an object with init, step, close; `store`, `scheduler`: not
+    yet; must be None.
+
+    **Returns:** variables `initial_state`, `final_state` (case, state), `result` (case,), `draw:path`
+    for every dispersed leaf; attributes `rollouts_per_s` (warm), `compile_s`, `percentiles` (with
+    confidence bounds), `success_rate` with Wilson bounds, `failures`, and the linear covariance
+    beside the sampled one.
+
+    **Raises:** `ValueError` for bad arguments.
+    """
+    import xarray as xr
+
+    for name, value in (("store", store), ("scheduler", scheduler)):
+        if value is not None:
+            raise ValueError(f"sweep: {name} is {value!r}, but sweeps run in memory; leave it out.")
+    if cases < 1:
+        raise ValueError(f"sweep: cases is {cases}; give at least 1.")
+    if tile < 1:
+        raise ValueError(f"sweep: tile is {tile}; give at least 1.")
+    if dtype is not None:
+        mission = cast(mission, dtype)
+    draw(mission, dispersions, jax.random.key(0))  # refuses bad paths and shapes at once
+
+    tiles = -(-cases // tile)
+    shape_key = jax.random.key(seed)
+    began = time.perf_counter()
+    compiled = _fly_tile.lower(mission, dispersions, shape_key, jnp.asarray(0), tile).compile()
+    compile_s = time.perf_counter() - began
+
+    state = None if progress is None else progress.init()
+    parts = []
+    began = time.perf_counter()
+    try:
+        for i in range(tiles):
+            parts.append(compiled(mission, dispersions, shape_key, jnp.asarray(i)))
+            if progress is not None:
+                jax.block_until_ready(parts[-1])
+                state = progress.step(state, (i + 1) / tiles)
+        parts = jax.device_get(parts)
+    finally:
+        if progress is not None:
+            progress.close(state)
+    elapsed = time.perf_counter() - began
+    joined = jax.tree_util.tree_map(lambda *leaves: np.concatenate(leaves)[:cases], *parts)
+
+    good = joined["code"] == _code(RESULTS.successful)
+    states = mission.plant.state_names
+    reasons, counts = np.unique(joined["code"][~good], return_counts=True)
+    failures = {_message(int(code)): int(k) for code, k in zip(reasons, counts, strict=True)}
+    centre, covariance = linear_covariance(mission, dispersions)
+    finals = joined["final_state"][good]
+    attrs = {
+        "cases": cases,
+        "seed": seed,
+        "tile": tile,
+        "dtype": str(joined["final_state"].dtype),
+        "rollouts_per_s": tiles * tile / elapsed,
+        "compile_s": compile_s,
+        "failures": failures,
+        "success_rate": float(good.mean()),
+        "success_rate_bounds": wilson_bounds(int(good.sum()), cases),
+        "percentiles": summarise(finals, states),
+        "nominal_final_state": np.asarray(centre).tolist(),
+        "linear_covariance": np.asarray(covariance).tolist(),
+        "sample_covariance": (np.cov(finals.T) if len(finals) > 1 else np.zeros(covariance.shape))
+        .reshape(covariance.shape)
+        .tolist(),
+    }
+    variables = {
+        "initial_state": (("case", "state"), joined["initial_state"]),
+        "final_state": (("case", "state"), joined["final_state"]),
+        "saturated": (("case",), joined["saturated"]),
+        "result": (("case",), joined["code"]),
+    }
+    for path, values in joined["draws"].items():
+        dims = ("case",) + tuple(f"{path}:{j}" for j in range(values.ndim - 1))
+        variables[f"draw:{path}"] = (dims, values)
+    return xr.Dataset(
+        variables, coords={"case": np.arange(cases), "state": list(states)}, attrs=attrs
+    )
+
+
+def case_key(seed: Any, case: Any) -> Array:
+    """The PRNG key of case `case`: (seed, case) and nothing else."""
+    key = seed if isinstance(seed, jax.Array) else jax.random.key(seed)
+    return jax.random.fold_in(key, case)
+
+
+@eqx.filter_jit
+def _fly_tile(
+    mission: Mission, dispersions: dict[str, Distribution], key: Array, index: Array, tile: int
+) -> dict[str, Any]:
+    cases = index * tile + jnp.arange(tile)
+
+    def fly(case: Array) -> dict[str, Any]:
+        k_draw, k_noise = jax.random.split(case_key(key, case))
+        draws = draw(mission, dispersions, k_draw)
+        flown = apply(mission, draws)
+        flight = simulate(flown, k_noise, "ends")
+        return {
+            "initial_state": flown.initial_state,
+            "final_state": flight.final_state,
+            "saturated": flight.saturated,
+            "code": flight.result._value,
+            "draws": draws,
+        }
+
+    return jax.vmap(fly)(cases)
+
+
+def cast(mission: Mission, dtype: str) -> Mission:
+    """`mission` with every floating leaf in `dtype`: flights and sweeps also run in float32."""
+    if dtype not in ("float32", "float64"):
+        raise ValueError(f"dtype is {dtype!r}; choose 'float64' or 'float32'.")
+    if dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
+        raise ValueError("dtype 'float64' needs jax_enable_x64; enable it, or choose 'float32'.")
+    floating = lambda a: eqx.is_array(a) and jnp.issubdtype(a.dtype, jnp.floating)
+    change = lambda a: a.astype(dtype) if floating(a) else a
+    return jax.tree_util.tree_map(change, mission)
+
+
+def _code(item: RESULTS) -> int:
+    return int(item._value)  # pyright: ignore
+
+
+def _message(code: int) -> str:
+    for name in RESULTS._name_to_item:  # pyright: ignore
+        if _code(getattr(RESULTS, name)) == code:
+            return name
+    return f"code {code}"

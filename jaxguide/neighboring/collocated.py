@@ -1,0 +1,94 @@
+"""The paper's Legendre pseudospectral gain map on each remaining horizon: eqs (22)-(49)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.neighboring.linearization import canonical, second_variation, terminal_conditions
+from jaxguide.spectral import differentiation_matrix, nodes_lgl
+from jaxguide.trajectory import Extremal
+
+
+def assemble(
+    D: Float[Array, "N+1 N+1"],
+    half: Float[Array, ""],
+    M: Float[Array, "N+1 2n 2n"],
+    psi: Float[Array, "n 2n"],
+) -> Float[Array, "n(2N+3) 2n(N+1)"]:
+    """V of eq. (40): canonical equations (36), (37) at all LGL points, then the end conditions.
+
+    Unknowns Z = (X, Lambda), each stacked node by node (eq. 35).
+    """
+    points, n = D.shape[0], psi.shape[0]
+    eye = jnp.eye(n, dtype=D.dtype)
+    same = jnp.eye(points, dtype=D.dtype)
+    block = lambda a: jnp.einsum("kl,kij->kilj", same, a).reshape(points * n, points * n)
+    derivative = jnp.einsum("kl,ij->kilj", D, eye).reshape(points * n, points * n)
+    upper = [derivative - half * block(M[:, :n, :n]), -half * block(M[:, :n, n:])]
+    lower = [-half * block(M[:, n:, :n]), derivative - half * block(M[:, n:, n:])]
+    gap = jnp.zeros((n, (points - 1) * n), D.dtype)
+    end = [gap, psi[:, :n], gap, psi[:, n:]]  # eqs (41), (42)
+    return jnp.concatenate([jnp.concatenate(row, axis=1) for row in (upper, lower, end)])
+
+
+def _square_rows(points: int, n: int) -> np.ndarray:
+    """Rows kept by the square variant: no state equation at the first point, no costate
+    equation at the last. 2n fewer rows leave as many equations as unknowns."""
+    rows = np.arange(n * (2 * points + 1))
+    state_first = rows < n
+    costate_last = (rows >= n * (2 * points - 1)) & (rows < 2 * n * points)
+    return rows[~(state_first | costate_last)]
+
+
+def solve_horizons(
+    extremal: Extremal, times: Float[Array, " time"], nodes: int, square: bool
+) -> Float[Array, "time unknown n"]:
+    """Z per x_0 (eq. 45, with the identity of x_0 itself on top) for the horizon from each time.
+
+    Least squares by QR, one horizon at a time: LAPACK under `vmap` may hang, and the matrices are
+    large enough to fill the machine. Nothing is truncated (no `rcond`).
+    """
+    problem, n = extremal.problem, extremal.problem.n
+    tau_host, _ = nodes_lgl(nodes)
+    tau = jnp.asarray(tau_host, times.dtype)
+    D = differentiation_matrix(tau)
+    psi = terminal_conditions(extremal).psi
+    keep = _square_rows(nodes, n) if square else None
+
+    def one(t0: Array) -> Array:
+        half = (extremal.t[-1] - t0) / 2
+        t = t0 + half * (tau + 1)  # eq. (22)
+        point = extremal(t)
+        v = jax.vmap(lambda t, x, u, c: second_variation(problem, t, x, u, c))(t, *point)
+        V = assemble(D, half, jax.vmap(canonical)(v).M, psi)
+        V = V if keep is None else V[keep]
+        V0, Ve = V[:, :n], V[:, n:]  # eq. (43)
+        if keep is None:
+            q, r = jnp.linalg.qr(Ve)
+            W = -jax.scipy.linalg.solve_triangular(r, q.T @ V0)  # eq. (45)
+        else:
+            W = -jnp.linalg.solve(Ve, V0)
+        return jnp.concatenate([jnp.eye(n, dtype=W.dtype), W])
+
+    return jax.lax.map(one, times)
+
+
+def history_maps(
+    extremal: Extremal, times: Float[Array, " time"], Z: Float[Array, "time unknown n"], nodes: int
+) -> tuple[Array, Array, Array]:
+    """LGL points, W1 (eq. 46) and the control per initial deviation at them (eq. 49)."""
+    problem, n = extremal.problem, extremal.problem.n
+    tau = jnp.asarray(nodes_lgl(nodes)[0], times.dtype)
+    W1 = Z[:, : n * nodes].reshape(times.shape[0], nodes, n, n)
+    W2 = Z[:, n * nodes :].reshape(times.shape[0], nodes, n, n)
+
+    def rows(t0: Array) -> Array:
+        t = t0 + (extremal.t[-1] - t0) / 2 * (tau + 1)
+        point = extremal(t)
+        v = jax.vmap(lambda t, x, u, c: second_variation(problem, t, x, u, c))(t, *point)
+        return jax.vmap(canonical)(v).U
+
+    U = jax.vmap(rows)(times)
+    controls = U[..., :n] @ W1 + U[..., n:] @ W2
+    return tau, W1, controls

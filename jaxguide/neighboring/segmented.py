@@ -1,0 +1,349 @@
+r"""Gains by one backward sweep over short segments.
+
+The adjoint rows $G(t) = [G_x\ G_\lambda]$ of the end conditions, $\dot G = -G M$,
+$G(t_f) = [\psi_x\ \psi_\lambda]$, annihilate every neighbouring extremal: $G y = 0$ at all times,
+so $\delta\lambda = S\,\delta x$ with $S = -G_\lambda^{-1} G_x$. Unlike a Riccati sweep nothing is
+infinite at a hard end. On each segment the transition matrix is collocated at Gauss points in
+integral form (which superconverges) by Picard sweeps, all segments at once; a short scan joins them.
+
+Arrays run (node, row, column, segment): the batch is last, so that small products vectorise.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import cholesky_positive, determinant_sign, solve
+from jaxguide.neighboring.linearization import (
+    Canonical,
+    Terminal,
+    canonical,
+    second_variation,
+    terminal_conditions,
+)
+from jaxguide.problem import is_free
+from jaxguide.spectral import interpolation_matrix, nodes_lg
+from jaxguide.trajectory import Extremal
+
+_GROUP = 8  # segments joined without renormalising; growth over so few is harmless
+_PROBES = 256
+
+
+class Sweep(NamedTuple):
+    """One solution of the adjoint rows: everything needed to evaluate them at any time."""
+
+    nodes: Float[Array, " s"]
+    breaks: Float[Array, " segment+1"]
+    slopes: Float[Array, "segment s 2n w"]  # (Psi(t_j) - I) / (t_e - t_j), Psi = Phi(t_e, t)
+    ends: Float[Array, "segment row w"]  # G at each segment's end
+    first: Float[Array, "row w"]  # G at the start of the horizon
+    scale: Float[Array, " 2n"]  # y = scale * scaled y
+
+    def locate(self, t: Array) -> Array:
+        last = self.breaks.shape[0] - 2
+        after = jnp.searchsorted(self.breaks, t, side="right", method="compare_all")
+        return jnp.clip(after - 1, 0, last)
+
+    def transition(self, i: Array, t: Array) -> Float[Array, "2n w"]:
+        """Phi(t_e, t) with the columns of parameters, scaled, inside segment `i`."""
+        a, b = self.breaks[i], self.breaks[i + 1]
+        tau = (2 * t - a - b) / jnp.where(b > a, b - a, 1.0)
+        row = interpolation_matrix(self.nodes, tau[None])[0]
+        slope = jnp.tensordot(row, self.slopes[i], 1)
+        return _identity(slope.shape, slope.dtype) + (b - t) * slope
+
+    def rows(self, t: Array) -> Float[Array, "row w"]:
+        """G(t), scaled."""
+        i = self.locate(t)
+        two_n = self.scale.shape[0]
+        b = self.breaks[i + 1]
+        end = self.ends[i]
+        carried = self.transition(i, t) - _identity((two_n, end.shape[1]), end.dtype)
+        return end + end[:, :two_n] @ carried
+
+
+def _identity(shape: tuple[int, ...], dtype: Any) -> Array:
+    return jnp.eye(shape[0], shape[1], dtype=dtype)
+
+
+def probe(extremal: Extremal, parameters: tuple[str, ...], t: Array) -> Canonical:
+    """M, b, U at one time."""
+    point = extremal(t)
+    v = second_variation(extremal.problem, t, point.x, point.u, point.costate, parameters)
+    return canonical(v)
+
+
+def scaling(extremal: Extremal, M: Float[Array, "probe 2n 2n"]) -> Float[Array, " 2n"]:
+    """Units in which M is balanced: states by their size, costates so that B and Q match."""
+    n = extremal.problem.n
+    size = jnp.max(jnp.abs(extremal.x), axis=0)
+    size = jnp.where(size > 0, size, 1.0)
+    B = jnp.max(jnp.abs(M[:, :n, n:] / (size[:, None] * size[None, :])[None]))
+    Q = jnp.max(jnp.abs(M[:, n:, :n] * (size[:, None] * size[None, :])[None]))
+    ratio = jnp.where((B > 0) & (Q > 0), Q / jnp.where(B > 0, B, 1.0), 1 / jnp.where(B > 0, B, 1.0))
+    ratio = jnp.where(jnp.isfinite(ratio) & (ratio > 0), ratio, 1.0)
+    beta = jnp.where((B > 0) & (Q > 0), jnp.sqrt(ratio), ratio)
+    return jax.lax.stop_gradient(jnp.concatenate([size, beta / size]))
+
+
+def place_breaks(
+    t: Float[Array, " probe"], M: Float[Array, "probe 2n 2n"], segments: int
+) -> Float[Array, " segment+1"]:
+    r"""Breaks that equidistribute $|M'|/|M| + \sqrt{|M''|/|M|} + |M|$, with a floor.
+
+    The first two are the inverse length over which M changes; |M| bounds the Picard contraction.
+    """
+    h = jnp.diff(t)
+    norm = jnp.sqrt(jnp.sum(M**2, axis=(1, 2)))
+    slope = jnp.diff(M, axis=0) / h[:, None, None]
+    bend = jnp.diff(slope, axis=0) / ((h[1:] + h[:-1]) / 2)[:, None, None]
+    size = lambda a: jnp.sqrt(jnp.sum(a**2, axis=(1, 2)))
+    middle = (norm[1:] + norm[:-1]) / 2 + jnp.finfo(t.dtype).tiny
+    bend = size(bend)
+    bend = jnp.maximum(jnp.append(bend, bend[-1:]), jnp.concatenate([bend[:1], bend]))
+    density = size(slope) / middle + jnp.sqrt(bend / middle) + 0.5 * middle
+    density = jnp.where(jnp.isfinite(density), density, 0.0)
+    span = t[-1] - t[0]
+    floor = 2.0 / span + 0.1 * jnp.sum(density * h) / span
+    mass = jnp.concatenate([jnp.zeros(1, t.dtype), jnp.cumsum((density + floor) * h)])
+    wanted = mass[-1] * jnp.linspace(0.0, 1.0, segments + 1, dtype=t.dtype)
+    breaks = jnp.interp(wanted, mass, t).at[0].set(t[0]).at[-1].set(t[-1])
+    return jax.lax.stop_gradient(breaks)
+
+
+def _gauss_integration(s: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gauss nodes, weights, and W with W_ij = integral of l_j from tau_i to 1."""
+    x, w = nodes_lg(s)
+    legendre = np.polynomial.legendre
+    vander = legendre.legvander(x, s - 1)
+    coefficients = vander.T * w[None, :] * (np.arange(s)[:, None] + 0.5)  # exact projection
+    primitive = np.stack([legendre.legint(np.eye(s)[k], lbnd=1.0) for k in range(s)])
+    W = -(legendre.legval(x, primitive.T).T @ coefficients)
+    return x, w, W
+
+
+def collocate(
+    M: Float[Array, "s 2n w segment"],
+    widths: Float[Array, " segment"],
+    start: Float[Array, "s 2n w segment"] | None,
+    sweeps: int,
+) -> tuple[Array, Array]:
+    """Phi(t_e, t) with parameter columns, at the Gauss nodes and at the segment's start."""
+    s, two_n, w, _ = M.shape
+    _, weights, W = _gauss_integration(s)
+    W, weights = jnp.asarray(W, M.dtype), jnp.asarray(weights, M.dtype)
+    half = (widths / 2)[None, None, None, :]
+    eye = _identity((two_n, w), M.dtype)[None, :, :, None]
+
+    def times_m(psi: Array) -> Array:
+        products = [psi[:, :, k, None] * M[:, None, k] for k in range(two_n)]
+        return sum(products[1:], products[0])
+
+    # The first sweep from Psi = I needs no product: F = M.
+    psi = eye + half * jnp.tensordot(W, M, 1) if start is None else start
+
+    def sweep(_: Any, psi: Array) -> Array:
+        return eye + half * jnp.tensordot(W, times_m(psi), 1)
+
+    psi = jax.lax.fori_loop(0, sweeps - (start is None), sweep, psi)
+    return psi, eye[0] + half[0] * jnp.tensordot(weights, times_m(psi), 1)
+
+
+def _orthonormal_rows(G: Array, n: int, two_n: int) -> Array:
+    """Row operations that keep G's row space: Gram-Schmidt, earlier (hard) rows first."""
+    rows = []
+    for i in range(G.shape[0]):
+        row = G[i]
+        for done in rows[: min(i, n)]:
+            row = row - jnp.dot(row[:two_n], done[:two_n]) * done
+        if i < n:
+            size = jnp.sqrt(jnp.dot(row[:two_n], row[:two_n]))
+            row = row / jnp.where(size > 0, size, 1.0)
+        rows.append(row)
+    return jnp.stack(rows)
+
+
+def join(
+    terminal: Float[Array, "row w"], transitions: Float[Array, "2n w segment"], n: int
+) -> tuple[Float[Array, "segment row w"], Float[Array, "row w"]]:
+    """G at the segments' ends, and at the very start, from the end conditions backwards."""
+    two_n, w, segments = transitions.shape
+    extra = jnp.concatenate(
+        [jnp.zeros((w - two_n, two_n), terminal.dtype), jnp.eye(w - two_n, dtype=terminal.dtype)],
+        axis=1,
+    )
+    extra = jnp.broadcast_to(extra[:, :, None], (w - two_n, w, segments))
+    full = jnp.concatenate([transitions, extra]).transpose(2, 0, 1)
+    groups = full.reshape(segments // _GROUP, _GROUP, w, w)
+
+    def back(after: Array, here: Array) -> tuple[Array, Array]:
+        now = after @ here
+        return now, after
+
+    eye = jnp.broadcast_to(jnp.eye(w, dtype=terminal.dtype), (groups.shape[0], w, w))
+    whole, suffix = jax.lax.scan(back, eye, groups.transpose(1, 0, 2, 3), reverse=True)
+
+    def step(G: Array, group: Array) -> tuple[Array, Array]:
+        G = _orthonormal_rows(G, n, two_n)
+        return G @ group, G
+
+    first, at_group_end = jax.lax.scan(step, terminal, whole, reverse=True)
+    ends = at_group_end[:, None] @ suffix.transpose(1, 0, 2, 3)
+    return ends.reshape(segments, terminal.shape[0], w), first
+
+
+def solve_sweeps(
+    extremal: Extremal,
+    terminal: Terminal,
+    segments: int,
+    nodes: int,
+    sweeps: int,
+    parameters: tuple[str, ...],
+) -> tuple[Sweep, Sweep, Array]:
+    """The adjoint rows twice, on `nodes` and on `nodes + 2` Gauss points; and where H_uu > 0."""
+    problem = extremal.problem
+    n, p = problem.n, len(parameters)
+    two_n, q = 2 * n, terminal.psi_target.shape[1]
+    t_probe = _probe_times(extremal)
+    M_probe = jax.vmap(lambda t: probe(extremal, (), t).M)(t_probe)
+    scale = scaling(extremal, M_probe)
+    ratio = scale[None, :] / scale[:, None]
+    breaks = place_breaks(t_probe, M_probe * ratio[None], segments)
+    widths = jnp.diff(breaks)
+
+    constant = jnp.concatenate([scale, jnp.ones(p + q, scale.dtype)])
+    rows = jnp.concatenate([terminal.psi, terminal.psi_p, terminal.psi_target], axis=1)
+    if is_free(problem.final_time):
+        rows = jnp.concatenate([rows, terminal.time[None]])
+    rows = rows * constant[None, :]
+
+    def matrices(s: int) -> tuple[Array, Array, Array]:
+        tau = jnp.asarray(nodes_lg(s)[0], breaks.dtype)
+        middle = (breaks[1:] + breaks[:-1]) / 2
+        times = middle[None, :] + (widths / 2)[None, :] * tau[:, None]
+
+        def at(t: Array) -> tuple[Array, Array]:
+            point = extremal(t)
+            v = second_variation(problem, t, point.x, point.u, point.costate, parameters)
+            c = canonical(v)
+            b = jnp.concatenate([c.b, jnp.zeros((two_n, q), c.b.dtype)], axis=1)
+            M = jnp.concatenate([c.M * ratio, b / scale[:, None]], axis=1)
+            return M, cholesky_positive(v.H_uu)
+
+        M, convex = jax.vmap(jax.vmap(at))(times)
+        return M.transpose(0, 2, 3, 1), convex, times
+
+    def finish(psi: Array, begin: Array, times: Array, s: int) -> Sweep:
+        eye = _identity(begin.shape[:2], begin.dtype)[None, :, :, None]
+        gap = (breaks[1:][None, :] - times)[:, None, None, :]
+        slopes = (psi - eye) / jnp.where(gap > 0, gap, 1.0)
+        ends, first = join(rows, begin, n)
+        tau = jnp.asarray(nodes_lg(s)[0], breaks.dtype)
+        return Sweep(tau, breaks, slopes.transpose(3, 0, 1, 2), ends, first, scale)
+
+    M, convex, times = matrices(nodes)
+    psi, begin = collocate(M, widths, None, sweeps)
+    coarse = finish(psi, begin, times, nodes)
+
+    # The finer one starts from the coarser, so few sweeps show the difference.
+    M2, _, times2 = matrices(nodes + 2)
+    to_finer = interpolation_matrix(coarse.nodes, jnp.asarray(nodes_lg(nodes + 2)[0], M.dtype))
+    slopes = jnp.tensordot(to_finer, coarse.slopes.transpose(1, 2, 3, 0), 1)
+    eye = _identity(begin.shape[:2], begin.dtype)[None, :, :, None]
+    start = eye + (breaks[1:][None, :] - times2)[:, None, None, :] * slopes
+    psi2, begin2 = collocate(M2, widths, start, 3)
+    finer = finish(psi2, begin2, times2, nodes + 2)
+    return coarse, finer, jnp.all(convex, axis=0)
+
+
+def _probe_times(extremal: Extremal) -> Array:
+    """Times to look for rapid change: evenly within each of the extremal's own segments."""
+    breaks = extremal.breaks
+    per = max(8, -(-_PROBES // (breaks.shape[0] - 1)))
+    inner = jnp.linspace(0.0, 1.0, per + 1, dtype=breaks.dtype)[:-1]
+    times = breaks[:-1, None] + jnp.diff(breaks)[:, None] * inner[None, :]
+    return jnp.append(times.reshape(-1), breaks[-1])
+
+
+class Gains(NamedTuple):
+    """Costate and control per deviation of state, parameters and target, at one time."""
+
+    S: Float[Array, "n w-n"]
+    K: Float[Array, "m w-n"]
+    time: Float[Array, " w-n"]
+    rounding: Float[Array, ""]
+
+
+def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> Gains:
+    """S = -G_lambda^-1 [G_x G_p G_target] and K = U_x + U_lambda S at `t`, unscaled."""
+    two_n = sweep.scale.shape[0]
+    n = two_n // 2
+    G = sweep.rows(t)
+    known = jnp.concatenate([G[:n, :n], G[:n, two_n:]], axis=1)
+    inverse = solve(G[:n, n:two_n], jnp.eye(n, dtype=G.dtype))
+    S = -inverse @ known
+    # One step of refinement, and Skeel's bound of what rounding leaves.
+    S = S - inverse @ (G[:n, n:two_n] @ S + known)
+    size = jnp.abs(inverse) @ (jnp.abs(G[:n, n:two_n]) @ jnp.abs(S) + jnp.abs(known))
+    rounding = jnp.finfo(G.dtype).eps * jnp.max(size) / jnp.max(jnp.abs(S) + 1e-300)
+    width = jnp.concatenate([sweep.scale[:n], jnp.ones(known.shape[1] - n, G.dtype)])
+    S = sweep.scale[n:, None] * S / width[None, :]
+    direct = jnp.concatenate(
+        [c.U[:, :n], c.U_p, jnp.zeros((c.U.shape[0], known.shape[1] - n - c.U_p.shape[1]), G.dtype)],
+        axis=1,
+    )
+    K = direct + c.U[:, n:] @ S
+    if free_time:
+        row = G[n]
+        y = row[n:two_n] / sweep.scale[n:]
+        rest = jnp.concatenate([row[:n], row[two_n:]]) / width
+        time = rest + y @ S
+    else:
+        time = jnp.zeros(known.shape[1], G.dtype)
+    return Gains(S, K, time, rounding)
+
+
+def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
+    """Whether det G_lambda changes sign between each time and the end: a conjugate point."""
+    n = sweep.scale.shape[0] // 2
+    at_ends = jax.vmap(lambda G: determinant_sign(G[:n, n : 2 * n]))(sweep.ends[:-1])
+    at_times = jax.vmap(lambda t: determinant_sign(sweep.rows(t)[:n, n : 2 * n]))(times)
+    baseline = at_ends[-1] if sweep.ends.shape[0] > 1 else at_times[-1]
+    inner = sweep.breaks[1:-1]
+    later = inner[None, :] >= times[:, None]
+    return jnp.any(later & (at_ends != baseline)[None, :], axis=1) | (at_times != baseline)
+
+
+def closed_loop(
+    sweep: Sweep, t_from: Array, t_to: Array
+) -> Float[Array, "n n"]:
+    """dx(t_to) per dx(t_from) on neighbouring extremals, chained segment by segment.
+
+    Inside a segment y(r) = Psi(r)^-1 Psi(l) y(l), and Psi is symplectic: its inverse needs no
+    solve.
+    """
+    n = sweep.scale.shape[0] // 2
+    two_n = 2 * n
+
+    def step(X: Array, i: Array) -> tuple[Array, None]:
+        l = jnp.clip(t_from, sweep.breaks[i], sweep.breaks[i + 1])
+        r = jnp.clip(t_to, sweep.breaks[i], sweep.breaks[i + 1])
+        inside = r > l
+        left = sweep.transition(i, l)[:, :two_n]
+        right = sweep.transition(i, r)[:, :two_n]
+        end = sweep.ends[i]
+        G = end[:n, :two_n] @ left
+        S = -solve(G[:, n:], G[:, :n])
+        y = left @ jnp.concatenate([jnp.eye(n, dtype=S.dtype), S])
+        # inverse of [[a, b], [c, d]] symplectic is [[d^T, -b^T], [-c^T, a^T]]; its x rows:
+        a_step = right[n:, n:].T @ y[:n] - right[:n, n:].T @ y[n:]
+        return jnp.where(inside, a_step, jnp.eye(n, dtype=S.dtype)) @ X, None
+
+    segments = sweep.ends.shape[0]
+    X, _ = jax.lax.scan(step, jnp.eye(n, dtype=sweep.ends.dtype), jnp.arange(segments))
+    return sweep.scale[:n, None] * X / sweep.scale[None, :n]
+
+

@@ -1,0 +1,169 @@
+"""Guess-free starts for shooting: many cheap trial flights, their costates by least squares,
+then a damped Newton iteration on all of them at once, in fixed shapes and without LAPACK."""
+
+from typing import Any
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import solve
+from jaxguide.nominal.conditions import (
+    Unknowns,
+    boundary_residual,
+    canonical_rates,
+    horizon,
+    number_of_constraints,
+)
+from jaxguide.problem import Problem, bounds_of, initial_values, is_free, start_value
+
+_STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
+
+
+def rk4(rate: Any, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:
+    """`y` at `times` by one classical Runge-Kutta step between each pair."""
+
+    def step(y: Array, interval: tuple) -> tuple[Array, Array]:
+        t, h = interval
+        k1 = rate(t, y)
+        k2 = rate(t + h / 2, y + h / 2 * k1)
+        k3 = rate(t + h / 2, y + h / 2 * k2)
+        k4 = rate(t + h, y + h * k3)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return y, y
+
+    _, ys = jax.lax.scan(step, y, (times[:-1], jnp.diff(times)))
+    return jnp.concatenate([y[None], ys])
+
+
+def coarse_ends(problem: Problem, z: Unknowns, steps: int) -> Float[Array, "arc 2n+1"]:
+    """Each arc's end by fixed Runge-Kutta steps: good enough to choose among starts."""
+    arcs = z.starts.shape[0]
+    t0, tf = horizon(problem, z)
+    grid = jnp.linspace(0.0, 1.0, arcs * steps + 1, dtype=z.starts.dtype)
+    times = t0 + (tf - t0) * grid
+    index = jnp.arange(arcs)[:, None] * steps + jnp.arange(steps + 1)[None, :]
+    y = jnp.concatenate([z.starts, jnp.zeros((arcs, 1), z.starts.dtype)], axis=1)
+    flow = lambda y, ts: rk4(lambda t, y: canonical_rates(problem, t, y), y, ts)[-1]
+    return jax.vmap(flow)(y, times[index])
+
+
+def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any) -> Unknowns:
+    r"""A start from a random control: fly it, then choose $\nu$ so that H_u is smallest.
+
+    The costate is affine in nu, so least squares over the flight gives it and with it the right
+    scale of every multiplier: nothing about the costates is guessed.
+    """
+    n, m, q = problem.n, problem.m, number_of_constraints(problem)
+    k_u, k_t, k_x = jax.random.split(key, 3)
+    lo, hi = bounds_of(problem.control_bounds, m, dtype)
+    finite = jnp.isfinite(lo) & jnp.isfinite(hi)
+    r = jax.random.uniform(k_u, (2, m), dtype, -1.0, 1.0)
+    middle = jnp.where(finite, (lo + hi) / 2, 0.0)
+    half = jnp.where(finite, (hi - lo) / 2, 3.0)
+    ends = jnp.clip(middle[None] + half[None] * r, lo[None], hi[None])
+
+    x0, free = initial_values(problem, dtype)
+    scatter = jax.random.normal(k_x, (n,), dtype) * (1 + jnp.abs(x0)) * 0.5
+    x0 = jnp.where(jnp.asarray(free), x0 + scatter, x0)
+    t0 = jnp.asarray(start_value(problem.initial_time), dtype)
+    tf = jnp.asarray(start_value(problem.final_time), dtype)
+    if is_free(problem.final_time):
+        # Log-uniform within a factor of 4 of the guess, inside the bounds.
+        factor = jnp.exp(jax.random.uniform(k_t, (), dtype, -1.4, 1.4))
+        span = jnp.maximum(tf - t0, 1e-3)
+        tf = jnp.clip(
+            t0 + span * factor,
+            jnp.asarray(problem.final_time.lo, dtype),
+            jnp.asarray(problem.final_time.hi, dtype),
+        )
+    total = arcs * steps
+    times = t0 + (tf - t0) * jnp.linspace(0.0, 1.0, total + 1, dtype=dtype)
+    control = lambda t: ends[0] + (ends[1] - ends[0]) * (t - t0) / (tf - t0)
+    xs = rk4(lambda t, x: problem.dynamics(t, x, control(t)), x0, times)
+
+    # Adjoint matrix: column 0 carries the costs, columns 1.. the constraints (times nu).
+    g_e = jax.grad(problem.endpoint_cost, argnums=1)(x0, xs[-1], t0, tf)
+    j_e = jax.jacfwd(problem.endpoint_constraints, argnums=1)(x0, xs[-1], t0, tf)
+    terminal = jnp.concatenate([g_e[:, None], j_e.T], axis=1)
+    unit = jnp.zeros(1 + q, dtype).at[0].set(1.0)
+
+    def adjoint(carry: Array, node: tuple) -> tuple[Array, Array]:
+        t, x, h = node
+        u = control(t)
+        f_x = jax.jacfwd(problem.dynamics, argnums=1)(t, x, u)
+        cost_x = jax.grad(problem.running_cost, argnums=1)(t, x, u)
+        rate = lambda p: f_x.T @ p + cost_x[:, None] * unit[None, :]
+        k1 = rate(carry)
+        k2 = rate(carry + h / 2 * k1)
+        new = carry + h * k2
+        return new, new
+
+    backward = (times[:-1][::-1], xs[:-1][::-1], jnp.diff(times)[::-1])
+    _, lams = jax.lax.scan(adjoint, terminal, backward)
+    lams = jnp.concatenate([lams[::-1], terminal[None]])
+
+    def h_u_rows(t: Array, x: Array, lam: Array) -> Array:
+        u = control(t)
+        f_u = jax.jacfwd(problem.dynamics, argnums=2)(t, x, u)
+        cost_u = jax.grad(problem.running_cost, argnums=2)(t, x, u)
+        return f_u.T @ lam + cost_u[:, None] * unit[None, :]
+
+    rows = jax.vmap(h_u_rows)(times, xs, lams).reshape(-1, 1 + q)
+    a, b = rows[:, 1:], rows[:, 0]
+    normal = a.T @ a
+    ridge = 1e-8 * (jnp.trace(normal) / max(q, 1) + 1e-30)
+    nu = -solve(normal + ridge * jnp.eye(q, dtype=dtype), a.T @ b)
+    costate = lams[:, :, 0] + lams[:, :, 1:] @ nu
+    starts = jnp.concatenate([xs, costate], axis=1)[: total : steps]
+    none = jnp.zeros((0,), dtype)
+    return Unknowns(
+        starts,
+        nu,
+        t0[None] if is_free(problem.initial_time) else none,
+        tf[None] if is_free(problem.final_time) else none,
+    )
+
+
+def damped_newton(
+    problem: Problem, z: Unknowns, steps: int, iterations: int
+) -> tuple[Unknowns, Array]:
+    """Newton on the coarse boundary conditions, step length by trial; returns z and max|residual|."""
+    flat, unravel = jax.flatten_util.ravel_pytree(z)
+
+    def residual(v: Array) -> Array:
+        z = unravel(v)
+        return boundary_residual(problem, z, coarse_ends(problem, z, steps))
+
+    def size(v: Array) -> Array:
+        value = jnp.max(jnp.abs(residual(clipped(v))))
+        return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+    def clipped(v: Array) -> Array:
+        z = unravel(v)
+        keep = lambda t, spec: (
+            jnp.clip(t, jnp.asarray(spec.lo, t.dtype), jnp.asarray(spec.hi, t.dtype))
+            if is_free(spec)
+            else t
+        )
+        z = z._replace(
+            t0=keep(z.t0, problem.initial_time), tf=keep(z.tf, problem.final_time)
+        )
+        return jax.flatten_util.ravel_pytree(z)[0]
+
+    def body(carry: tuple) -> tuple:
+        v, best, k = carry
+        dv = -solve(jax.jacfwd(residual)(v), residual(v))
+        trials = v[None] + jnp.asarray(_STEP_LENGTHS, v.dtype)[:, None] * dv[None]
+        sizes = jax.vmap(size)(trials)
+        i = jnp.argmin(sizes)
+        # Accept the least residual even if it rose slightly: Newton often climbs before it falls.
+        better = sizes[i] < 2.0 * best
+        v = jnp.where(better, clipped(trials[i]), v)
+        return v, jnp.where(better, sizes[i], best), k + jnp.where(better, 1, iterations)
+
+    start = (flat, size(flat), jnp.zeros((), jnp.int32))
+    going = lambda c: (c[1] > 1e-9) & jnp.isfinite(c[1]) & (c[2] < iterations)
+    v, norm, _ = jax.lax.while_loop(going, body, start)
+    return unravel(v), norm

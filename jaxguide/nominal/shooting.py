@@ -1,0 +1,359 @@
+"""Indirect multiple shooting: the necessary conditions solved to rounding, differentiably."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import SmallLU, cholesky_positive
+from jaxguide.nominal.conditions import (
+    Unknowns,
+    boundary_residual,
+    canonical_rates,
+    horizon,
+    number_of_constraints,
+)
+from jaxguide.nominal.control import minimising_control
+from jaxguide.nominal.guess import coarse_ends, damped_newton, random_start
+from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free, start_value
+from jaxguide.spectral import nodes_lgl
+from jaxguide.trajectory import Extremal, Multipliers
+from jaxguide.types import RESULTS
+
+
+class Shooting(eqx.Module):
+    """Single (`arcs=1`) or multiple indirect shooting.
+
+    Three stages, each in fixed shapes: without a guess, `starts` random flights are shot at once
+    with coarse steps and the best converged one kept; adaptive integration (Diffrax, Dopri8 at
+    `tolerance`) with Newton (Optimistix); and a last Newton on the mesh that the adaptive steps
+    suggest, through which derivatives are implicit, forward and reverse.
+
+    **Arguments:**
+
+    - `arcs`: shooting arcs; 1 is single shooting. More arcs tolerate unstable dynamics.
+    - `segments`, `degree`: the mesh of the returned Extremal (`segments` a multiple of `arcs`).
+    - `tolerance`: relative and absolute, of the integration.
+    - `starts`, `seed`: how many random starts when no guess is given.
+
+    **Error:** boundary conditions to about 1e-12 of their scale; the Certificate tells.
+    """
+
+    arcs: int = eqx.field(static=True, default=4)
+    segments: int = eqx.field(static=True, default=32)
+    degree: int = eqx.field(static=True, default=12)
+    tolerance: float = eqx.field(static=True, default=1e-13)
+    starts: int = eqx.field(static=True, default=32)
+    coarse_steps: int = eqx.field(static=True, default=24)
+    seed: int = eqx.field(static=True, default=0)
+    max_steps: int = eqx.field(static=True, default=2048)
+
+    def __check_init__(self):
+        if self.arcs < 1 or self.segments % self.arcs:
+            raise ValueError(
+                f"Shooting: segments={self.segments} must be a multiple of arcs={self.arcs} >= 1."
+            )
+        if self.starts < 1:
+            raise ValueError(f"Shooting: starts={self.starts}; need at least 1.")
+
+    def check(self, problem: Problem) -> None:
+        """Refuses what indirect shooting cannot do. Host only."""
+        kind = type(problem).__name__
+        fixed = ("initial_time", "final_time", "initial_state")
+        for name, value in vars(problem).items():
+            if name not in fixed and is_free(value):
+                raise ValueError(
+                    f"{kind}.{name} is a jg.Free static parameter, which shooting does not "
+                    "optimise; give it a number, or add it as a state with zero rate and a free "
+                    "initial value."
+                )
+        if not is_free(problem.final_time) and np.any(np.isinf(np.asarray(problem.final_time))):
+            raise ValueError(
+                f"{kind}.final_time is infinite; shooting needs a finite one (try some ten time "
+                "constants)."
+            )
+        x = jax.ShapeDtypeStruct((problem.n,), jnp.result_type(float))
+        u = jax.ShapeDtypeStruct((problem.m,), jnp.result_type(float))
+        t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        if jax.eval_shape(problem.integrands, t, x, u).shape[0]:
+            raise ValueError(
+                f"{kind}.integrands: integral constraints are not for shooting; write each as a "
+                "state with an endpoint constraint."
+            )
+        q = number_of_constraints(problem)
+        lo, hi = (np.broadcast_to(np.asarray(b), (q,)) for b in problem.endpoint_bounds)
+        if np.any(lo != hi):
+            i = int(np.argmax(lo != hi))
+            raise ValueError(
+                f"{kind}.endpoint_bounds: constraint {i} is an inequality [{lo[i]}, {hi[i]}]; "
+                "shooting takes equalities: set both bounds to the active value, or leave it out."
+            )
+
+    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
+        """The extremal, without host checks; `solve` wraps this. Pure."""
+        dtype = jnp.result_type(float)
+        if guess is None:
+            z = jax.lax.stop_gradient(self._multistart(jax.lax.stop_gradient(problem), dtype))
+        elif isinstance(guess, Unknowns):
+            z = guess
+        else:
+            z = jax.lax.stop_gradient(self._from_guess(jax.lax.stop_gradient(problem), guess, dtype))
+        frozen = jax.lax.stop_gradient(problem)
+        z, fractions = jax.lax.stop_gradient(self._adaptive(frozen, z))
+        return self._on_mesh(problem, z, fractions, certifier)
+
+    def _multistart(self, problem: Problem, dtype: Any) -> Unknowns:
+        keys = jax.random.split(jax.random.key(self.seed), self.starts)
+
+        def attempt(key: Array) -> tuple[Unknowns, Array, Array]:
+            z = random_start(problem, key, self.arcs, self.coarse_steps, dtype)
+            z, norm = damped_newton(problem, z, self.coarse_steps, 40)
+            return z, norm, _objective(problem, z, coarse_ends(problem, z, self.coarse_steps))
+
+        zs, norms, costs = jax.vmap(attempt)(keys)
+        norms = jnp.where(jnp.isfinite(norms), norms, jnp.inf)
+        converged = (norms < 1e-7) & jnp.isfinite(costs)
+        by_cost = jnp.argmin(jnp.where(converged, costs, jnp.inf))
+        best = jnp.where(jnp.any(converged), by_cost, jnp.argmin(norms))
+        return jax.tree_util.tree_map(lambda a: a[best], zs)
+
+    def _from_guess(self, problem: Problem, guess: Any, dtype: Any) -> Unknowns:
+        none = jnp.zeros((0,), dtype)
+        pick = lambda spec, value: jnp.asarray(value, dtype)[None] if is_free(spec) else none
+        if isinstance(guess, Extremal):
+            times = jnp.linspace(guess.t[0], guess.t[-1], self.arcs + 1)[:-1]
+            y = jnp.concatenate([guess.x, guess.costate], axis=1)
+            return Unknowns(
+                jax.vmap(lambda t: guess.interpolate(y, t))(times),
+                guess.multipliers.endpoint,
+                pick(problem.initial_time, guess.t[0]),
+                pick(problem.final_time, guess.t[-1]),
+            )
+        costate = jnp.asarray(guess, dtype)
+        if costate.shape != (problem.n,):
+            raise ValueError(
+                f"guess has shape {costate.shape}; give an Extremal or the {problem.n} initial "
+                f"costates of {problem.state_names}."
+            )
+        x0 = random_start(problem, jax.random.key(0), 1, 1, dtype).starts[0, : problem.n]
+        z = Unknowns(
+            jnp.concatenate([x0, costate])[None],
+            jnp.zeros((number_of_constraints(problem),), dtype),
+            pick(problem.initial_time, start_value(problem.initial_time)),
+            pick(problem.final_time, start_value(problem.final_time)),
+        )
+        # Fly it once, arc by arc, and take nu from the transversality condition it ends with.
+        ends = []
+        for k in range(self.arcs):
+            part = self._arc_window(problem, z, k)
+            end = coarse_ends(part, z, self.coarse_steps)[0, : 2 * problem.n]
+            ends.append(z.starts[0])
+            z = z._replace(starts=end[None])
+        n = problem.n
+        t0, tf = horizon(problem, z)
+        j_e = jax.jacfwd(problem.endpoint_constraints, argnums=1)(x0, z.starts[0, :n], t0, tf)
+        g_e = jax.grad(problem.endpoint_cost, argnums=1)(x0, z.starts[0, :n], t0, tf)
+        nu = jnp.linalg.lstsq(j_e.T, z.starts[0, n:] - g_e)[0] if j_e.shape[0] else z.nu
+        return z._replace(starts=jnp.stack(ends), nu=nu)
+
+    def _arc_window(self, problem: Problem, z: Unknowns, k: int) -> Problem:
+        t0, tf = horizon(problem, z)
+        a, b = t0 + (tf - t0) * k / self.arcs, t0 + (tf - t0) * (k + 1) / self.arcs
+        where = lambda p: (p.initial_time, p.final_time)
+        return eqx.tree_at(where, problem, (a, b), is_leaf=lambda v: v is None or is_free(v))
+
+    def _adaptive(self, problem: Problem, z: Unknowns) -> tuple[Unknowns, Array]:
+        """Newton with adaptive integration; also where the mesh's segments should break."""
+        fractions = jnp.linspace(0.0, 1.0, self.arcs + 1, dtype=z.starts.dtype)
+
+        def fly(z: Unknowns, saveat: diffrax.SaveAt, problem: Problem) -> diffrax.Solution:
+            t0, tf = horizon(problem, z)
+            times = t0 + (tf - t0) * fractions
+            y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
+            solve_arc = lambda y, a, b: diffrax.diffeqsolve(
+                diffrax.ODETerm(lambda t, y, args: canonical_rates(args, t, y)),
+                diffrax.Dopri8(),
+                a,
+                b,
+                None,
+                y,
+                args=problem,
+                saveat=saveat,
+                stepsize_controller=diffrax.PIDController(
+                    rtol=self.tolerance, atol=self.tolerance
+                ),
+                max_steps=self.max_steps,
+                adjoint=diffrax.ForwardMode(),
+                throw=False,
+            )
+            return jax.vmap(solve_arc)(y, times[:-1], times[1:])
+
+        def residual(z: Unknowns, problem: Problem) -> Array:
+            ends = fly(z, diffrax.SaveAt(t1=True), problem).ys
+            return boundary_residual(problem, z, ends[:, 0])  # pyright: ignore
+
+        z = _newton(residual, z, problem)
+        solution = fly(z, diffrax.SaveAt(dense=True, steps=True), problem)
+        t0, tf = horizon(problem, z)
+        scaled = (solution.ts - t0) / (tf - t0)  # (arcs, max_steps), inf beyond the last step
+        scaled = jnp.sort(jnp.where(jnp.isfinite(scaled), scaled, 1.0).reshape(-1))
+        used = jnp.sum(jnp.isfinite(solution.ts)).astype(z.starts.dtype)  # pyright: ignore
+        count = jnp.arange(1, scaled.shape[0] + 1, dtype=z.starts.dtype)
+        grid = jnp.concatenate([jnp.zeros(1, z.starts.dtype), scaled])
+        steps = jnp.concatenate([jnp.zeros(1, z.starts.dtype), jnp.minimum(count, used)])
+        # Equal numbers of adaptive steps per segment, mixed with uniform spacing as a floor.
+        wanted = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=z.starts.dtype)
+        density = 0.8 * steps / used + 0.2 * grid
+        breaks = jnp.interp(wanted, density, grid).at[0].set(0.0).at[-1].set(1.0)
+
+        arc_breaks = breaks[:: self.segments // self.arcs][:-1]
+        arc = jnp.clip(jnp.searchsorted(fractions, arc_breaks, side="right") - 1, 0, self.arcs - 1)
+        evaluate = lambda i, s: jax.tree_util.tree_map(
+            lambda leaf: leaf[i] if eqx.is_array(leaf) else leaf, solution
+        ).evaluate(t0 + s * (tf - t0))
+        starts = jax.vmap(evaluate)(arc, arc_breaks)[:, : 2 * problem.n]
+        # With one arc the break is the start itself: keep it exact.
+        starts = starts.at[0].set(z.starts[0])
+        ok = jnp.all(jnp.isfinite(starts)) & jnp.all(jnp.isfinite(breaks))
+        breaks = jnp.where(ok, breaks, wanted)
+        starts = jnp.where(ok, starts, z.starts)
+        return z._replace(starts=starts), breaks
+
+    def _on_mesh(
+        self, problem: Problem, z: Unknowns, breaks: Array, certifier: Any
+    ) -> Extremal:
+        p = self.degree + 1
+        tau = jnp.asarray(nodes_lgl(p)[0], z.starts.dtype)
+        inner = breaks[:-1, None] + jnp.diff(breaks)[:, None] * (tau[None, :-1] + 1) / 2
+        fractions = jnp.concatenate([inner.reshape(-1), breaks[-1:]])
+        per_arc = (fractions.shape[0] - 1) // self.arcs
+        index = jnp.arange(self.arcs)[:, None] * per_arc + jnp.arange(per_arc + 1)[None, :]
+
+        def fly(z: Unknowns, problem: Problem) -> Array:
+            t0, tf = horizon(problem, z)
+            times = t0 + (tf - t0) * fractions
+            y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
+            return jax.vmap(lambda y, ts: _dopri8(problem, y, ts))(y, times[index])
+
+        def residual(z: Unknowns, problem: Problem) -> Array:
+            return boundary_residual(problem, z, fly(z, problem)[:, -1])
+
+        z = _newton(residual, z, problem)
+        arcs = fly(z, problem)
+        y = jnp.concatenate([arcs[:, :-1].reshape(-1, arcs.shape[2]), arcs[-1, -1:]])
+        t0, tf = horizon(problem, z)
+        t = t0 + (tf - t0) * fractions
+        n = problem.n
+        x, costate = y[:, :n], y[:, n : 2 * n]
+        u = jax.vmap(lambda t, x, c: minimising_control(problem, t, x, c))(t, x, costate)
+        u = unwrap_angles(problem, t, x, u)
+        worst = jnp.max(jnp.abs(residual(z, problem)))
+        zeros = lambda k: jnp.zeros((t.shape[0], k), t.dtype)
+        size = jax.eval_shape(problem.path_constraints, t[0], x[0], u[0]).shape[0]
+        return Extremal(
+            t=t,
+            x=x,
+            u=u,
+            reference_nodes=tau,
+            costate=costate,
+            final_time=tf,
+            objective=_objective(problem, z, arcs[:, -1]),
+            multipliers=Multipliers(z.nu, zeros(size), zeros(n), zeros(problem.m)),
+            result=_judge(problem, t, x, u, costate, worst),
+            residual=worst,
+            problem=problem,
+            certifier=certifier,
+        )
+
+
+def _newton(residual: Any, z: Unknowns, problem: Problem) -> Unknowns:
+    fn = lambda z, problem: residual(z, problem)
+    return optx.root_find(
+        fn,
+        optx.Newton(rtol=1e-12, atol=1e-12, linear_solver=SmallLU()),
+        z,
+        problem,
+        max_steps=20,
+        adjoint=optx.ImplicitAdjoint(linear_solver=SmallLU()),
+        throw=False,
+    ).value
+
+
+def _dopri8(problem: Problem, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:
+    """One Dormand-Prince 8 step between each pair of `times`: differentiable both ways.
+
+    The tableau is Diffrax's; its own `step` loops in a way that has no forward mode. A scan over
+    the stages compiles the right-hand side once.
+    """
+    tableau = diffrax.Dopri8.tableau
+    stages = tableau.num_stages
+    a = np.zeros((stages, stages))
+    for i, row in enumerate(tableau.a_lower):
+        a[i + 1, : i + 1] = row
+    c = np.concatenate([[0.0], tableau.c])
+    a, b, c = (jnp.asarray(v, y.dtype) for v in (a, tableau.b_sol, c))
+
+    def step(y: Array, ends: tuple) -> tuple[Array, Array]:
+        t, h = ends
+
+        def stage(ks: Array, row: tuple) -> tuple[Array, None]:
+            a_i, c_i, i = row
+            k = canonical_rates(problem, t + c_i * h, y + h * (a_i @ ks))
+            return ks.at[i].set(k), None
+
+        ks = jnp.zeros((stages, y.shape[0]), y.dtype)
+        ks, _ = jax.lax.scan(stage, ks, (a, c, jnp.arange(stages)))
+        y = y + h * (b @ ks)
+        return y, y
+
+    _, ys = jax.lax.scan(step, y, (times[:-1], jnp.diff(times)))
+    return jnp.concatenate([y[None], ys])
+
+
+def _objective(problem: Problem, z: Unknowns, ends: Array) -> Array:
+    n = problem.n
+    t0, tf = horizon(problem, z)
+    return problem.endpoint_cost(z.starts[0, :n], ends[-1, :n], t0, tf) + jnp.sum(ends[:, 2 * n])
+
+
+def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"]) -> Array:
+    """Removes jumps of 2 pi from controls in which the Problem is periodic."""
+    turn = 2 * np.pi
+    columns = []
+    for j in range(problem.m):
+        shift = jnp.zeros_like(u).at[:, j].set(turn)
+        rates = jax.vmap(lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u)))
+        here, there = rates(t, x, u), rates(t, x, u + shift)
+        periodic = jnp.all(jnp.abs(here - there) <= 1e-9 * (1 + jnp.abs(here)))
+        turns = jnp.round(jnp.diff(u[:, j]) / turn)
+        total = jnp.concatenate([jnp.zeros(1, u.dtype), jnp.cumsum(turns)])
+        columns.append(jnp.where(periodic, u[:, j] - turn * total, u[:, j]))
+    return jnp.stack(columns, axis=1)
+
+
+def _judge(problem: Problem, t: Array, x: Array, u: Array, costate: Array, worst: Array) -> RESULTS:
+    """What the shot extremal is worth."""
+    scale = 1 + jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(costate))
+    converged = worst <= 1e-9 * scale  # Newton is quadratic: short of this it did not converge
+    h_uu = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
+        problem, t, x, u, costate
+    )
+    minimising = jnp.all(jax.vmap(cholesky_positive)(h_uu))
+    slack = 1e-9
+    xlo, xhi = bounds_of(problem.state_bounds, problem.n, x.dtype)
+    ulo, uhi = bounds_of(problem.control_bounds, problem.m, u.dtype)
+    path = jax.vmap(problem.path_constraints)(t, x, u)
+    plo, phi = bounds_of(problem.path_bounds, path.shape[1], path.dtype)
+    inside = lambda v, lo, hi: jnp.all((v >= lo[None] - slack) & (v <= hi[None] + slack))
+    legal = inside(x, xlo, xhi) & inside(u, ulo, uhi) & inside(path, plo, phi)
+    result = RESULTS.where(minimising, RESULTS.successful, RESULTS.not_minimising)
+    result = RESULTS.where(legal, result, RESULTS.bounds_violated)
+    return RESULTS.where(converged, result, RESULTS.not_converged)
+
+

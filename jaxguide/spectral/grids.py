@@ -1,0 +1,76 @@
+"""Standard grids with their matrices: host-side NumPy constants, cached, for use under `jit`."""
+
+import functools as ft
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxguide.spectral.nodes import Nodes, nodes_cgl, nodes_lg, nodes_lgl, nodes_lgr
+
+FAMILIES: dict[str, Callable[[int], Nodes]] = {
+    "lg": nodes_lg,
+    "lgl": nodes_lgl,
+    "cgl": nodes_cgl,
+    "lgr-left": lambda n: nodes_lgr(n, "left"),
+    "lgr-right": lambda n: nodes_lgr(n, "right"),
+}
+
+
+class Grid(NamedTuple):
+    """A family's constants, read-only float64, tau on [-1, 1] dimensionless.
+
+    `differentiation` and `integration` (from -1) are the matrices of `matrices.py`; `ends` (2, n)
+    evaluates the interpolant at -1 and +1.
+    """
+
+    x: np.ndarray
+    w: np.ndarray
+    differentiation: np.ndarray
+    integration: np.ndarray
+    ends: np.ndarray
+
+
+@ft.cache
+def grid(family: str, n: int) -> Grid:
+    """Nodes, weights and matrices of `n` points.
+
+    Written in NumPy beside the JAX versions (tests hold them equal) so that the constants are
+    float64 whatever JAX is set to, and are no part of the compiled program.
+
+    **Arguments:** `family`: "lg", "lgl", "cgl", "lgr-left" or "lgr-right"; `n`: number of points.
+
+    **Returns:** a `Grid`; cast it to the dtype in use.
+
+    **Error:** as `differentiation_matrix` and `integration_matrix`.
+
+    **Raises:** `ValueError` for another family or too few points.
+
+    **Source:** as the functions named.
+    """
+    if family not in FAMILIES:
+        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}.")
+    x, w = FAMILIES[family](n)
+    eye = np.eye(n)
+    # 2 is the inverse capacity of [-1, 1]; in this order of factors float64 holds past n = 512.
+    weights = 1 / np.prod((x[:, None] - x[None, :] + eye / 2) * 2, axis=1)
+    d = (weights[None, :] / weights[:, None] - eye) / (x[:, None] - x[None, :] + eye)
+    d -= np.diag(d.sum(axis=1))
+
+    def rows(query):
+        dx = query[:, None] - x[None, :]
+        hit = dx == 0
+        terms = weights[None, :] / np.where(hit, 1.0, dx)
+        terms = np.where(hit.any(axis=1, keepdims=True), hit, terms)
+        return terms / terms.sum(axis=1, keepdims=True)
+
+    points, gauss = nodes_lg(n)
+    k = np.arange(n)
+    legendre = (k[:, None] + 0.5) * np.polynomial.legendre.legvander(points, n - 1).T * gauss
+    p = np.polynomial.legendre.legvander(x, n) - (-1.0) ** np.arange(n + 1)
+    lower = np.concatenate([np.zeros((n, 1)), p[:, : n - 1]], axis=1)
+    b = (p[:, 1:] - lower) / (2 * k + 1) @ legendre @ rows(points)
+    out = Grid(x, w, d, b, rows(np.array([-1.0, 1.0])))
+    for a in out:
+        a.flags.writeable = False
+    return out

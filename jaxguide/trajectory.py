@@ -1,0 +1,128 @@
+"""Trajectories on a piecewise polynomial mesh, and extremals: trajectories with costates."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import solve
+from jaxguide.problem import Problem, hamiltonian
+from jaxguide.spectral import interpolate
+from jaxguide.types import RESULTS
+
+
+class Point(NamedTuple):
+    """State, control and costate at one time (or stacked over times)."""
+
+    x: Array
+    u: Array
+    costate: Array
+
+
+class Multipliers(eqx.Module):
+    """Covectors of an extremal: <= 0 at lower, >= 0 at upper bounds."""
+
+    endpoint: Float[Array, " q"]
+    path: Float[Array, "node p"]
+    state: Float[Array, "node n"]
+    control: Float[Array, "node m"]
+
+
+class Trajectory(eqx.Module):
+    """State and control at nodes: segments that share their ends, each a polynomial.
+
+    Segment s holds nodes s (p - 1) ... (s + 1)(p - 1), placed like `reference_nodes` (p,) of
+    [-1, 1], both ends included.
+    """
+
+    t: Float[Array, " node"]
+    x: Float[Array, "node n"]
+    u: Float[Array, "node m"]
+    reference_nodes: Float[Array, " p"]
+
+    @property
+    def breaks(self) -> Float[Array, " segment+1"]:
+        return self.t[:: self.reference_nodes.shape[0] - 1]
+
+    @property
+    def degree(self) -> int:
+        """Degree of each segment's polynomial."""
+        return self.reference_nodes.shape[0] - 1
+
+    def by_segment(self, values: Float[Array, "node k"]) -> Float[Array, "segment p k"]:
+        """Nodal values gathered segment by segment, shared ends repeated."""
+        p = self.reference_nodes.shape[0]
+        segments = (self.t.shape[0] - 1) // (p - 1)
+        index = jnp.arange(segments)[:, None] * (p - 1) + jnp.arange(p)[None, :]
+        return values[index]
+
+    def interpolate(self, values: Float[Array, "node *k"], t: Any) -> Array:
+        """`values` at the nodes, interpolated at the scalar `t`; held beyond the ends."""
+        p = self.reference_nodes.shape[0]
+        t = jnp.clip(jnp.asarray(t, self.t.dtype), self.t[0], self.t[-1])
+        breaks = self.breaks
+        last = breaks.shape[0] - 2
+        s = jnp.clip(jnp.searchsorted(breaks, t, side="right") - 1, 0, last)
+        local = jax.lax.dynamic_slice_in_dim(values, s * (p - 1), p)
+        a, b = breaks[s], breaks[s + 1]
+        width = jnp.where(b > a, b - a, 1.0)
+        tau = (2 * t - a - b) / width
+        return interpolate(self.reference_nodes, local, tau)
+
+
+class Extremal(Trajectory):
+    """A trajectory that meets the necessary conditions, with costates and multipliers.
+
+    Signs: H = F + lambda^T f is minimised; lambda(tf) = dEbar/dxf, lambda(t0) = -dEbar/dx0,
+    H(tf) = -dEbar/dtf, H(t0) = dEbar/dt0, with Ebar = E + nu^T e. (The 2002 paper prints
+    lambda(tf) = -dPhi/dx in eq. (8), which contradicts its eq. (9) for a minimised H.)
+    """
+
+    costate: Float[Array, "node n"]
+    final_time: Float[Array, ""]
+    objective: Float[Array, ""]
+    multipliers: Multipliers
+    result: RESULTS
+    residual: Float[Array, ""]
+    problem: Problem
+    certifier: Callable = eqx.field(static=True)
+
+    @property
+    def certificate(self) -> Any:
+        """How good this extremal is: every check, computed when asked for."""
+        return self.certifier(self)
+
+    def __call__(self, t: Any) -> Point:
+        """State, control and costate at `t`, scalar or (T,); held beyond the horizon.
+
+        The control comes from H_u = 0 at the interpolated state and costate where that is regular
+        (one Newton step from its interpolant, so an angle stays unwrapped).
+        """
+        t = jnp.asarray(t, self.t.dtype)
+        if t.ndim == 1:
+            return jax.vmap(self.__call__)(t)
+        t = jnp.clip(t, self.t[0], self.t[-1])
+        n, m = self.problem.n, self.problem.m
+        all_values = jnp.concatenate([self.x, self.u, self.costate], axis=1)
+        y = self.interpolate(all_values, t)
+        x, u, costate = y[:n], y[n : n + m], y[n + m :]
+        return Point(x, polish_control(self.problem, t, x, u, costate), costate)
+
+
+def polish_control(
+    problem: Problem, t: Any, x: Array, u: Array, costate: Array
+) -> Float[Array, " m"]:
+    """One Newton step on H_u = 0 from a nearby `u`; `u` itself where that step is not small."""
+    gradient = jax.grad(hamiltonian, argnums=3)
+    h_u = gradient(problem, t, x, u, costate)
+    h_uu = jax.jacfwd(gradient, argnums=3)(problem, t, x, u, costate)
+    # Double where: a singular H_uu must not leak NaN into derivatives of the branch not taken.
+    scale = jnp.max(jnp.abs(h_uu))
+    regular = scale > 0
+    safe = jnp.where(regular, h_uu, jnp.eye(u.shape[0], dtype=u.dtype))
+    step = solve(safe, h_u)
+    small = regular & jnp.all(jnp.abs(step) <= 1e-3 * (1 + jnp.abs(u)))
+    return jnp.where(small, u - jnp.where(small, step, 0.0), u)

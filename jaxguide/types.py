@@ -1,0 +1,92 @@
+"""Array aliases, every way a computation can fail with its remedy, and the float64 gate."""
+
+import difflib
+from collections.abc import Iterable
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+Times = Float[Array, " time"]
+State = Float[Array, " state"]
+Control = Float[Array, " control"]
+
+
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a computation ended. `successful`, or a reason that names the remedy.
+
+    Extends the enumerations of Diffrax, Optimistix and Lineax, so `RESULTS.promote` lifts theirs.
+    """
+
+    successful = ""
+    not_converged = (
+        "The boundary conditions were not met: the shooting iterations stalled. Pass a `guess` "
+        "(an Extremal or costates), raise `starts` or `arcs`, or check that the end is reachable."
+    )
+    infeasible = (
+        "No trajectory meets the endpoint constraints: relax a constraint or a bound, or free a "
+        "component of the initial state or the final time."
+    )
+    bounds_violated = (
+        "The extremal leaves state, control or path bounds, which indirect shooting does not "
+        "enforce: use a method that does, or widen the bounds."
+    )
+    not_minimising = (
+        "H_uu is not positive definite on the extremal (Legendre-Clebsch): the control does not "
+        "minimise the Hamiltonian there, or the arc is singular. Add a control cost, or use a "
+        "direct method."
+    )
+    underresolved = (
+        "The mesh does not resolve the solution: raise `segments` or `degree`, or lower tolerance."
+    )
+    gain_unresolved = (
+        "The gain is not resolved at this time: raise `segments` or `nodes`, or stay further "
+        "from the final time."
+    )
+    conjugate_point = (
+        "A conjugate point lies ahead of this time: the nominal is no minimum from here and the "
+        "gain means nothing. Choose another extremal or a shorter horizon."
+    )
+    outside_horizon = "Queried outside the nominal horizon; the command was held at its end."
+    saturated = "The command was limited to its cap; widen the cap if the authority is there."
+    diverged = (
+        "The flight left finite numbers: the plant diverged. Look at this case's dispersion, or "
+        "cap the command."
+    )
+
+
+class UnknownName(ValueError):
+    """A name that is not registered; the message suggests the nearest that is."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]):
+        known = tuple(known)
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
+        super().__init__(f"no {kind} named {name!r}: {hint}")
+
+
+class SolveError(RuntimeError):
+    """An outermost solve failed; the message says what was worst and what to try."""
+
+
+def require_x64(what: str) -> None:
+    """Raises `RuntimeError` unless float64 is enabled, which `what` needs for its accuracy."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise RuntimeError(
+            f"{what} needs float64, but JAX is running in float32. Call "
+            "jax.config.update('jax_enable_x64', True) before any array is made, or set the "
+            "environment variable JAX_ENABLE_X64=1."
+        )
+
+
+def is_traced(tree: object) -> bool:
+    """Whether any leaf of `tree` is a tracer, so that host-side checks must be skipped."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
+
+
+def as_float(x: object) -> Array:
+    """`x` as a floating array (integers become the default float)."""
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
