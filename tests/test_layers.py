@@ -82,7 +82,7 @@ def test_layers_of_the_package():
 @pytest.mark.parametrize(
     ("path", "line"),
     [
-        ("problem.py", "from jaxguide.solve import solve"),
+        ("problem.py", "from jaxguide.solving import solve"),
         ("spectral/nodes.py", "import jaxguide.problem"),
         ("spectral/nodes.py", "from ..problem import Problem"),
         ("spectral/nodes.py", "from jaxguide import problem as p"),
@@ -96,14 +96,14 @@ def test_layers_of_the_package():
 def test_checker_sees_an_upward_import(tmp_path, path, line):
     root = tmp_path / "jaxguide"
     sound = {
-        "__init__.py": "from jaxguide.solve import solve as solve",
+        "__init__.py": "from jaxguide.solving import solve as solve",
         "types.py": "import jax",
         "problem.py": "from jaxguide.types import RESULTS",
         "spectral/nodes.py": "from jaxguide.types import RESULTS\nfrom . import matrices",
         "spectral/matrices.py": "from jaxguide.spectral import nodes",
         "laws/gain.py": "from jaxguide import problem\nfrom ..problem import Problem",
         "flight/simulate.py": "import jaxguide.laws.gain",
-        "solve.py": "import jaxguide.problem as problem",
+        "solving.py": "import jaxguide.problem as problem",
         "cli.py": "import jaxguide as jg",
     }
     for name, text in sound.items():

@@ -14,10 +14,10 @@ from jaxguide.neighboring.collocated import history_maps, solve_horizons
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import (
     Sweep,
-    closed_loop,
     conjugate_ahead,
     gains_at,
     probe,
+    propagate,
     solve_sweeps,
 )
 from jaxguide.problem import bounds_of, is_free
@@ -80,11 +80,8 @@ class SegmentedSchedule(GainSchedule):
 
     def history(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         t_k, t = (jnp.asarray(v, self.times.dtype) for v in (t_k, t))
-        # At the very end K may be infinite while K X is not: stay a rounding error inside.
-        last = self.extremal.t[-1]
-        inside = last - 1e-7 * (last - self.extremal.t[0])
-        gain = gains_at(self.sweep, probe(self.extremal, (), t), jnp.minimum(t, inside), False)
-        return gain.K[:, : self._n] @ closed_loop(self.sweep, t_k, jnp.minimum(t, inside))
+        U = probe(self.extremal, (), t).U
+        return U @ propagate(self.sweep, t_k, t)
 
     @property
     def _n(self) -> int:
@@ -115,7 +112,9 @@ class CollocatedSchedule(GainSchedule):
         return x, interpolate(self.reference_nodes, self.control_maps[k], tau)
 
     def _sample(self, t: Array) -> Array:
-        after = jnp.searchsorted(self.times, t, side="right", method="compare_all")
+        # A time meant to be a sample may differ from it by rounding.
+        slack = 1e-12 * (self.times[-1] - self.times[0] + jnp.abs(t))
+        after = jnp.searchsorted(self.times, t + slack, side="right", method="compare_all")
         return jnp.clip(after - 1, 0, self.times.shape[0] - 1)
 
     def __call__(self, t: Any) -> Float[Array, "m n"]:

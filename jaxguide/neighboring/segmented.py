@@ -317,33 +317,30 @@ def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
     return jnp.any(later & (at_ends != baseline)[None, :], axis=1) | (at_times != baseline)
 
 
-def closed_loop(
-    sweep: Sweep, t_from: Array, t_to: Array
-) -> Float[Array, "n n"]:
-    """dx(t_to) per dx(t_from) on neighbouring extremals, chained segment by segment.
+def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "2n n"]:
+    """(dx, dlambda) at `t_to` per dx(t_from) on neighbouring extremals, segment by segment.
 
     Inside a segment y(r) = Psi(r)^-1 Psi(l) y(l), and Psi is symplectic: its inverse needs no
-    solve.
+    solve. At each break the costate is put back on S, which keeps growing modes out; inside the
+    last segment it is not, so that the end itself, where S may be infinite, is reached.
     """
     n = sweep.scale.shape[0] // 2
     two_n = 2 * n
 
-    def step(X: Array, i: Array) -> tuple[Array, None]:
+    def step(y: Array, i: Array) -> tuple[Array, None]:
         l = jnp.clip(t_from, sweep.breaks[i], sweep.breaks[i + 1])
         r = jnp.clip(t_to, sweep.breaks[i], sweep.breaks[i + 1])
-        inside = r > l
         left = sweep.transition(i, l)[:, :two_n]
         right = sweep.transition(i, r)[:, :two_n]
-        end = sweep.ends[i]
-        G = end[:n, :two_n] @ left
+        G = sweep.ends[i][:n, :two_n] @ left
         S = -solve(G[:, n:], G[:, :n])
-        y = left @ jnp.concatenate([jnp.eye(n, dtype=S.dtype), S])
-        # inverse of [[a, b], [c, d]] symplectic is [[d^T, -b^T], [-c^T, a^T]]; its x rows:
-        a_step = right[n:, n:].T @ y[:n] - right[:n, n:].T @ y[n:]
-        return jnp.where(inside, a_step, jnp.eye(n, dtype=S.dtype)) @ X, None
+        z = left @ jnp.concatenate([jnp.eye(n, dtype=S.dtype), S]) @ y[:n]
+        # inverse of [[a, b], [c, d]] symplectic is [[d^T, -b^T], [-c^T, a^T]]
+        a, b, c, d = right[:n, :n], right[:n, n:], right[n:, :n], right[n:, n:]
+        moved = jnp.concatenate([d.T @ z[:n] - b.T @ z[n:], a.T @ z[n:] - c.T @ z[:n]])
+        return jnp.where((r > l) | (i == first), moved, y), None
 
-    segments = sweep.ends.shape[0]
-    X, _ = jax.lax.scan(step, jnp.eye(n, dtype=sweep.ends.dtype), jnp.arange(segments))
-    return sweep.scale[:n, None] * X / sweep.scale[None, :n]
-
-
+    first = sweep.locate(t_from)
+    start = jnp.eye(two_n, n, dtype=sweep.ends.dtype)
+    y, _ = jax.lax.scan(step, start, jnp.arange(sweep.ends.shape[0], dtype=first.dtype))
+    return sweep.scale[:, None] * y / sweep.scale[None, :n]

@@ -39,13 +39,14 @@ def barycentric_weights(x: Float[Real, " n"]) -> Float[Array, " n"]:
     r"""$w_j = 1 / \prod_{k \ne j} g (x_j - x_k)$ with $g = 4 / (\max x - \min x)$.
 
     Scaling by the capacity (max - min) / 4 of the interval keeps the products near 1: at n = 512
-    they are within 1e-3 and 1e3 for Gaussian nodes and within float64 even for uniform ones.
+    the weights are between 4e-7 and 3e-3 for Gaussian nodes, which float32 bears, and between
+    3e-88 and 8e64 for uniform ones, which float64 does.
 
     **Arguments:** `x`: distinct nodes, any order (ascending is best), any interval.
 
     **Returns:** weights, dimensionless; differentiable in `x`.
 
-    **Error:** relative, about $\sqrt n \epsilon$ (n roundings).
+    **Error:** relative, about $\epsilon \sqrt n$ (each of n differences is rounded once).
 
     **Raises:** `ValueError` if known nodes coincide; traced ones give inf.
 
@@ -57,12 +58,14 @@ def barycentric_weights(x: Float[Real, " n"]) -> Float[Array, " n"]:
         return jnp.ones_like(x)
     dx = (x[:, None] - x[None, :]) * (4 / (jnp.max(x) - jnp.min(x)))
     dx = jnp.where(jnp.eye(n, dtype=bool), jnp.ones_like(dx), dx)
-    # Products of factors taken a stride apart, hence spread over the interval, stay near 1;
-    # products of neighbours would overflow float32 on the way.
-    rows = int(np.ceil(np.sqrt(n)))
-    stride = -(-n // rows)
-    dx = jnp.pad(dx, ((0, 0), (0, rows * stride - n)), constant_values=1)
-    return 1 / jnp.prod(jnp.prod(dx.reshape(n, rows, stride), axis=1), axis=1)
+    # A tree of products pairing factors half the grid apart: each partial product is one over
+    # spread nodes and stays near 1, where a run of neighbours would overflow float32. Not
+    # `jnp.prod` in stages, which XLA merges into one running product.
+    while dx.shape[1] > 1:
+        half = (dx.shape[1] + 1) // 2
+        rest = jnp.pad(dx[:, half:], ((0, 0), (0, 2 * half - dx.shape[1])), constant_values=1)
+        dx = dx[:, :half] * rest
+    return 1 / dx[:, 0]
 
 
 def differentiation_matrix(
