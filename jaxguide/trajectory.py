@@ -104,12 +104,15 @@ class Extremal(Trajectory):
         t = jnp.asarray(t, self.t.dtype)
         if t.ndim == 1:
             return jax.vmap(self.__call__)(t)
+        x, u, costate = self.point(t)
         t = jnp.clip(t, self.t[0], self.t[-1])
-        n, m = self.problem.n, self.problem.m
-        all_values = jnp.concatenate([self.x, self.u, self.costate], axis=1)
-        y = self.interpolate(all_values, t)
-        x, u, costate = y[:n], y[n : n + m], y[n + m :]
         return Point(x, polish_control(self.problem, t, x, u, costate), costate)
+
+    def point(self, t: Any) -> Point:
+        """The interpolant at the scalar `t`, its control as interpolated."""
+        n, m = self.problem.n, self.problem.m
+        y = self.interpolate(jnp.concatenate([self.x, self.u, self.costate], axis=1), t)
+        return Point(y[:n], y[n : n + m], y[n + m :])
 
 
 def polish_control(

@@ -14,9 +14,9 @@ from jaxguide.neighboring.collocated import history_maps, solve_horizons
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import (
     Sweep,
+    canonical_at,
     conjugate_ahead,
     gains_at,
-    probe,
     propagate,
     solve_sweeps,
 )
@@ -76,12 +76,13 @@ class SegmentedSchedule(GainSchedule):
 
     def __call__(self, t: Any) -> Float[Array, "m n"]:
         t = jnp.clip(jnp.asarray(t, self.times.dtype), self.times[0], self.times[-1])
-        return gains_at(self.sweep, probe(self.extremal, (), t), t, False).K[:, : self._n]
+        c, _ = canonical_at(self.extremal.problem, t, self.extremal(t), ())
+        return gains_at(self.sweep, c, t, False).K[:, : self._n]
 
     def history(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         t_k, t = (jnp.asarray(v, self.times.dtype) for v in (t_k, t))
-        U = probe(self.extremal, (), t).U
-        return U @ propagate(self.sweep, t_k, t)
+        c, _ = canonical_at(self.extremal.problem, t, self.extremal(t), ())
+        return c.U @ propagate(self.sweep, t_k, t)
 
     @property
     def _n(self) -> int:
@@ -206,14 +207,15 @@ def _segmented(
     n, p = problem.n, len(parameters)
     free_time = is_free(problem.final_time)
     terminal = terminal_conditions(extremal, parameters)
-    sweep, finer, convex = solve_sweeps(extremal, terminal, segments, nodes, sweeps, parameters)
-    c = jax.vmap(lambda t: probe(extremal, parameters, t))(times)
-    at = jax.vmap(lambda s, c, t: gains_at(s, c, t, free_time), in_axes=(None, 0, 0))
-    gains, check = at(sweep, c, times), at(finer, c, times)
-    K, fine = gains.K[:, :, :n], check.K[:, :, :n]
+    pair = solve_sweeps(extremal, terminal, times, segments, nodes, sweeps, parameters)
+    sweep, convex = pair.sweep, pair.convex
+    both = jax.tree_util.tree_map(lambda a, b: jnp.stack([a, b]), pair.sweep, pair.finer)
+    over_times = jax.vmap(lambda s, c, t: gains_at(s, c, t, free_time), in_axes=(None, 0, 0))
+    gains = jax.vmap(over_times, in_axes=(0, None, None))(both, pair.at_times, times)
+    K, fine = gains.K[0, :, :, :n], gains.K[1, :, :, :n]
     size = jnp.max(jnp.abs(fine), axis=(1, 2))
     difference = jnp.max(jnp.abs(K - fine), axis=(1, 2)) / jnp.where(size > 0, size, 1.0)
-    error = difference + 2 * check.rounding
+    error = difference + 2 * gains.rounding[1]
     error = jnp.where(jnp.isfinite(error), error, jnp.inf)
     end = sweep.breaks[1:]
     convex_ahead = ~jnp.any((end[None, :] > times[:, None]) & ~convex[None, :], axis=1)
@@ -232,9 +234,9 @@ def _segmented(
         resolved=fine_enough & convex_ahead & ~conjugate,
         result=result,
         bound_active=_bound_active(extremal, times),
-        K_parameters=gains.K[:, :, n : n + p],
-        K_target=gains.K[:, :, n + p :],
-        dtf_dx=gains.time[:, :n],
+        K_parameters=gains.K[0, :, :, n : n + p],
+        K_target=gains.K[0, :, :, n + p :],
+        dtf_dx=gains.time[0, :, :n],
         extremal=extremal,
         sweep=sweep,
     )

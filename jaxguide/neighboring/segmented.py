@@ -24,9 +24,9 @@ from jaxguide.neighboring.linearization import (
     second_variation,
     terminal_conditions,
 )
-from jaxguide.problem import is_free
+from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
-from jaxguide.trajectory import Extremal
+from jaxguide.trajectory import Extremal, Point
 
 _GROUP = 8  # segments joined without renormalising; growth over so few is harmless
 _PROBES = 256
@@ -39,7 +39,6 @@ class Sweep(NamedTuple):
     breaks: Float[Array, " segment+1"]
     slopes: Float[Array, "segment s 2n w"]  # (Psi(t_j) - I) / (t_e - t_j), Psi = Phi(t_e, t)
     ends: Float[Array, "segment row w"]  # G at each segment's end
-    first: Float[Array, "row w"]  # G at the start of the horizon
     scale: Float[Array, " 2n"]  # y = scale * scaled y
 
     def locate(self, t: Array) -> Array:
@@ -69,11 +68,12 @@ def _identity(shape: tuple[int, ...], dtype: Any) -> Array:
     return jnp.eye(shape[0], shape[1], dtype=dtype)
 
 
-def probe(extremal: Extremal, parameters: tuple[str, ...], t: Array) -> Canonical:
-    """M, b, U at one time."""
-    point = extremal(t)
-    v = second_variation(extremal.problem, t, point.x, point.u, point.costate, parameters)
-    return canonical(v)
+def canonical_at(
+    problem: Problem, t: Array, point: Point, parameters: tuple[str, ...]
+) -> tuple[Canonical, Array]:
+    """M, b, U at one point of the extremal, and whether H_uu is positive definite there."""
+    v = second_variation(problem, t, point.x, point.u, point.costate, parameters)
+    return canonical(v), cholesky_positive(v.H_uu)
 
 
 def scaling(extremal: Extremal, M: Float[Array, "probe 2n 2n"]) -> Float[Array, " 2n"]:
@@ -168,8 +168,8 @@ def _orthonormal_rows(G: Array, n: int, two_n: int) -> Array:
 
 def join(
     terminal: Float[Array, "row w"], transitions: Float[Array, "2n w segment"], n: int
-) -> tuple[Float[Array, "segment row w"], Float[Array, "row w"]]:
-    """G at the segments' ends, and at the very start, from the end conditions backwards."""
+) -> Float[Array, "segment row w"]:
+    """G at the segments' ends, from the end conditions backwards."""
     two_n, w, segments = transitions.shape
     extra = jnp.concatenate(
         [jnp.zeros((w - two_n, two_n), terminal.dtype), jnp.eye(w - two_n, dtype=terminal.dtype)],
@@ -190,73 +190,78 @@ def join(
         G = _orthonormal_rows(G, n, two_n)
         return G @ group, G
 
-    first, at_group_end = jax.lax.scan(step, terminal, whole, reverse=True)
+    _, at_group_end = jax.lax.scan(step, terminal, whole, reverse=True)
     ends = at_group_end[:, None] @ suffix.transpose(1, 0, 2, 3)
-    return ends.reshape(segments, terminal.shape[0], w), first
+    return ends.reshape(segments, terminal.shape[0], w)
+
+
+class Pair(NamedTuple):
+    """A sweep, a finer one beside it, and the canonical system at the requested times."""
+
+    sweep: Sweep
+    finer: Sweep
+    at_times: Canonical
+    convex: Array  # by segment: H_uu positive definite at its nodes
 
 
 def solve_sweeps(
     extremal: Extremal,
     terminal: Terminal,
+    times: Float[Array, " time"],
     segments: int,
     nodes: int,
     sweeps: int,
     parameters: tuple[str, ...],
-) -> tuple[Sweep, Sweep, Array]:
-    """The adjoint rows twice, on `nodes` and on `nodes + 2` Gauss points; and where H_uu > 0."""
+) -> Pair:
+    """The adjoint rows on `nodes` and on `nodes + 2` Gauss points a segment.
+
+    The second shows the error of the first. Both are stored on the finer points (a polynomial of
+    lower degree is exact there), so that everything after works on the pair at once.
+    """
     problem = extremal.problem
     n, p = problem.n, len(parameters)
     two_n, q = 2 * n, terminal.psi_target.shape[1]
     t_probe = _probe_times(extremal)
-    M_probe = jax.vmap(lambda t: probe(extremal, (), t).M)(t_probe)
+    M_probe = jax.vmap(lambda t: canonical_at(problem, t, extremal.point(t), ())[0].M)(t_probe)
     scale = scaling(extremal, M_probe)
     ratio = scale[None, :] / scale[:, None]
     breaks = place_breaks(t_probe, M_probe * ratio[None], segments)
     widths = jnp.diff(breaks)
+
+    counts = (nodes, nodes + 2)
+    taus = [jnp.asarray(nodes_lg(s)[0], breaks.dtype) for s in counts]
+    middle = (breaks[1:] + breaks[:-1]) / 2
+    where = [middle[None, :] + (widths / 2)[None, :] * tau[:, None] for tau in taus]
+    everywhere = jnp.concatenate([where[0].reshape(-1), where[1].reshape(-1), times])
+    c, convex = jax.vmap(lambda t: canonical_at(problem, t, extremal(t), parameters))(everywhere)
+    b = jnp.concatenate([c.b, jnp.zeros((*c.b.shape[:2], q), c.b.dtype)], axis=2)
+    M = jnp.concatenate([c.M * ratio[None], b / scale[None, :, None]], axis=2)
+    first, second = counts[0] * segments, sum(counts) * segments
+    by_node = lambda a, s: a.reshape(s, segments, two_n, -1).transpose(0, 2, 3, 1)
+    M1, M2 = by_node(M[:first], counts[0]), by_node(M[first:second], counts[1])
+
+    eye = _identity((two_n, M1.shape[2]), M.dtype)[None, :, :, None]
+    gaps = [(breaks[1:][None, :] - t)[:, None, None, :] for t in where]
+    slope = lambda psi, gap: (psi - eye) / jnp.where(gap > 0, gap, 1.0)
+    psi1, begin1 = collocate(M1, widths, None, sweeps)
+    to_finer = interpolation_matrix(taus[0], taus[1])
+    slopes1 = jnp.tensordot(to_finer, slope(psi1, gaps[0]), 1)
+    # The finer one starts from the coarser, so few sweeps show the difference.
+    psi2, begin2 = collocate(M2, widths, eye + gaps[1] * slopes1, 3)
+    slopes2 = slope(psi2, gaps[1])
 
     constant = jnp.concatenate([scale, jnp.ones(p + q, scale.dtype)])
     rows = jnp.concatenate([terminal.psi, terminal.psi_p, terminal.psi_target], axis=1)
     if is_free(problem.final_time):
         rows = jnp.concatenate([rows, terminal.time[None]])
     rows = rows * constant[None, :]
-
-    def matrices(s: int) -> tuple[Array, Array, Array]:
-        tau = jnp.asarray(nodes_lg(s)[0], breaks.dtype)
-        middle = (breaks[1:] + breaks[:-1]) / 2
-        times = middle[None, :] + (widths / 2)[None, :] * tau[:, None]
-
-        def at(t: Array) -> tuple[Array, Array]:
-            point = extremal(t)
-            v = second_variation(problem, t, point.x, point.u, point.costate, parameters)
-            c = canonical(v)
-            b = jnp.concatenate([c.b, jnp.zeros((two_n, q), c.b.dtype)], axis=1)
-            M = jnp.concatenate([c.M * ratio, b / scale[:, None]], axis=1)
-            return M, cholesky_positive(v.H_uu)
-
-        M, convex = jax.vmap(jax.vmap(at))(times)
-        return M.transpose(0, 2, 3, 1), convex, times
-
-    def finish(psi: Array, begin: Array, times: Array, s: int) -> Sweep:
-        eye = _identity(begin.shape[:2], begin.dtype)[None, :, :, None]
-        gap = (breaks[1:][None, :] - times)[:, None, None, :]
-        slopes = (psi - eye) / jnp.where(gap > 0, gap, 1.0)
-        ends, first = join(rows, begin, n)
-        tau = jnp.asarray(nodes_lg(s)[0], breaks.dtype)
-        return Sweep(tau, breaks, slopes.transpose(3, 0, 1, 2), ends, first, scale)
-
-    M, convex, times = matrices(nodes)
-    psi, begin = collocate(M, widths, None, sweeps)
-    coarse = finish(psi, begin, times, nodes)
-
-    # The finer one starts from the coarser, so few sweeps show the difference.
-    M2, _, times2 = matrices(nodes + 2)
-    to_finer = interpolation_matrix(coarse.nodes, jnp.asarray(nodes_lg(nodes + 2)[0], M.dtype))
-    slopes = jnp.tensordot(to_finer, coarse.slopes.transpose(1, 2, 3, 0), 1)
-    eye = _identity(begin.shape[:2], begin.dtype)[None, :, :, None]
-    start = eye + (breaks[1:][None, :] - times2)[:, None, None, :] * slopes
-    psi2, begin2 = collocate(M2, widths, start, 3)
-    finer = finish(psi2, begin2, times2, nodes + 2)
-    return coarse, finer, jnp.all(convex, axis=0)
+    ends = jax.vmap(lambda begin: join(rows, begin, n))(jnp.stack([begin1, begin2]))
+    pair = [
+        Sweep(taus[1], breaks, slopes.transpose(3, 0, 1, 2), ends[i], scale)
+        for i, slopes in enumerate((slopes1, slopes2))
+    ]
+    at_times = jax.tree_util.tree_map(lambda a: a[second:], c)
+    return Pair(*pair, at_times, jnp.all(convex[:first].reshape(counts[0], segments), axis=0))
 
 
 def _probe_times(extremal: Extremal) -> Array:
@@ -309,12 +314,14 @@ def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> Gains:
 def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
     """Whether det G_lambda changes sign between each time and the end: a conjugate point."""
     n = sweep.scale.shape[0] // 2
-    at_ends = jax.vmap(lambda G: determinant_sign(G[:n, n : 2 * n]))(sweep.ends[:-1])
-    at_times = jax.vmap(lambda t: determinant_sign(sweep.rows(t)[:n, n : 2 * n]))(times)
-    baseline = at_ends[-1] if sweep.ends.shape[0] > 1 else at_times[-1]
+    at_breaks, at_times = sweep.ends[:-1], jax.vmap(sweep.rows)(times)
+    rows = jnp.concatenate([at_breaks, at_times])[:, :n, n : 2 * n]
+    signs = jax.vmap(determinant_sign)(rows)
     inner = sweep.breaks[1:-1]
+    at_breaks, at_times = signs[: inner.shape[0]], signs[inner.shape[0] :]
+    baseline = at_breaks[-1]  # nothing is conjugate within the last segment of a resolved mesh
     later = inner[None, :] >= times[:, None]
-    return jnp.any(later & (at_ends != baseline)[None, :], axis=1) | (at_times != baseline)
+    return jnp.any(later & (at_breaks != baseline)[None, :], axis=1) | (at_times != baseline)
 
 
 def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "2n n"]:

@@ -20,7 +20,7 @@ from jaxguide.nominal.conditions import (
     number_of_constraints,
 )
 from jaxguide.nominal.control import minimising_control
-from jaxguide.nominal.guess import coarse_ends, damped_newton, random_start
+from jaxguide.nominal.guess import coarse_ends, damped_newton, objective, random_start
 from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free, start_value
 from jaxguide.spectral import nodes_lgl
 from jaxguide.trajectory import Extremal, Multipliers
@@ -52,7 +52,7 @@ class Shooting(eqx.Module):
     starts: int = eqx.field(static=True, default=32)
     coarse_steps: int = eqx.field(static=True, default=24)
     seed: int = eqx.field(static=True, default=0)
-    max_steps: int = eqx.field(static=True, default=2048)
+    max_steps: int = eqx.field(static=True, default=1024)
 
     def __check_init__(self):
         if self.arcs < 1 or self.segments % self.arcs:
@@ -113,8 +113,7 @@ class Shooting(eqx.Module):
 
         def attempt(key: Array) -> tuple[Unknowns, Array, Array]:
             z = random_start(problem, key, self.arcs, self.coarse_steps, dtype)
-            z, norm = damped_newton(problem, z, self.coarse_steps, 40)
-            return z, norm, _objective(problem, z, coarse_ends(problem, z, self.coarse_steps))
+            return damped_newton(problem, z, self.coarse_steps, 60)
 
         zs, norms, costs = jax.vmap(attempt)(keys)
         norms = jnp.where(jnp.isfinite(norms), norms, jnp.inf)
@@ -172,7 +171,7 @@ class Shooting(eqx.Module):
         """Newton with adaptive integration; also where the mesh's segments should break."""
         fractions = jnp.linspace(0.0, 1.0, self.arcs + 1, dtype=z.starts.dtype)
 
-        def fly(z: Unknowns, saveat: diffrax.SaveAt, problem: Problem) -> diffrax.Solution:
+        def fly(z: Unknowns, problem: Problem) -> diffrax.Solution:
             t0, tf = horizon(problem, z)
             times = t0 + (tf - t0) * fractions
             y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
@@ -184,7 +183,7 @@ class Shooting(eqx.Module):
                 None,
                 y,
                 args=problem,
-                saveat=saveat,
+                saveat=diffrax.SaveAt(steps=True),
                 stepsize_controller=diffrax.PIDController(
                     rtol=self.tolerance, atol=self.tolerance
                 ),
@@ -194,36 +193,41 @@ class Shooting(eqx.Module):
             )
             return jax.vmap(solve_arc)(y, times[:-1], times[1:])
 
-        def residual(z: Unknowns, problem: Problem) -> Array:
-            ends = fly(z, diffrax.SaveAt(t1=True), problem).ys
-            return boundary_residual(problem, z, ends[:, 0])  # pyright: ignore
+        def residual(z: Unknowns, problem: Problem) -> tuple[Array, Any]:
+            solution = fly(z, problem)
+            assert solution.ts is not None and solution.ys is not None
+            taken = jnp.isfinite(solution.ts)  # inf beyond the last step
+            last = jnp.sum(taken, axis=1) - 1
+            ends = jax.vmap(lambda ys, i: ys[i])(solution.ys, last)
+            return boundary_residual(problem, z, ends), (solution.ts, solution.ys)
 
-        z = _newton(residual, z, problem)
-        solution = fly(z, diffrax.SaveAt(dense=True, steps=True), problem)
+        z, (ts, ys) = _newton(residual, z, problem)
+        # Break where the solver stepped: equal numbers of its steps per segment, mixed with
+        # uniform spacing as a floor.
         t0, tf = horizon(problem, z)
-        scaled = (solution.ts - t0) / (tf - t0)  # (arcs, max_steps), inf beyond the last step
-        scaled = jnp.sort(jnp.where(jnp.isfinite(scaled), scaled, 1.0).reshape(-1))
-        used = jnp.sum(jnp.isfinite(solution.ts)).astype(z.starts.dtype)  # pyright: ignore
-        count = jnp.arange(1, scaled.shape[0] + 1, dtype=z.starts.dtype)
-        grid = jnp.concatenate([jnp.zeros(1, z.starts.dtype), scaled])
-        steps = jnp.concatenate([jnp.zeros(1, z.starts.dtype), jnp.minimum(count, used)])
-        # Equal numbers of adaptive steps per segment, mixed with uniform spacing as a floor.
-        wanted = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=z.starts.dtype)
-        density = 0.8 * steps / used + 0.2 * grid
+        scaled = jnp.where(jnp.isfinite(ts), (ts - t0) / (tf - t0), 2.0).reshape(-1)
+        order = jnp.argsort(scaled)
+        scaled, ys = scaled[order], ys.reshape(-1, ys.shape[2])[order, : 2 * problem.n]
+        used = jnp.sum(scaled <= 1.5)
+        count = jnp.minimum(jnp.arange(1, scaled.shape[0] + 1), used).astype(scaled.dtype)
+        zero = jnp.zeros(1, scaled.dtype)
+        grid = jnp.concatenate([zero, jnp.minimum(scaled, 1.0)])
+        density = 0.8 * jnp.concatenate([zero, count]) / used.astype(scaled.dtype) + 0.2 * grid
+        wanted = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=scaled.dtype)
         breaks = jnp.interp(wanted, density, grid).at[0].set(0.0).at[-1].set(1.0)
-
-        arc_breaks = breaks[:: self.segments // self.arcs][:-1]
-        arc = jnp.clip(jnp.searchsorted(fractions, arc_breaks, side="right") - 1, 0, self.arcs - 1)
-        evaluate = lambda i, s: jax.tree_util.tree_map(
-            lambda leaf: leaf[i] if eqx.is_array(leaf) else leaf, solution
-        ).evaluate(t0 + s * (tf - t0))
-        starts = jax.vmap(evaluate)(arc, arc_breaks)[:, : 2 * problem.n]
-        # With one arc the break is the start itself: keep it exact.
-        starts = starts.at[0].set(z.starts[0])
-        ok = jnp.all(jnp.isfinite(starts)) & jnp.all(jnp.isfinite(breaks))
-        breaks = jnp.where(ok, breaks, wanted)
-        starts = jnp.where(ok, starts, z.starts)
-        return z._replace(starts=starts), breaks
+        # Arcs begin at a step actually taken, whose state is known to full accuracy.
+        per_arc = self.segments // self.arcs
+        nearest = lambda s: jnp.argmin(jnp.abs(scaled - s))
+        step = jax.vmap(nearest)(breaks[per_arc:-1:per_arc])
+        breaks = breaks.at[per_arc:-1:per_arc].set(scaled[step])
+        starts = jnp.concatenate([z.starts[:1], ys[step]])
+        breaks = jnp.sort(breaks)
+        ok = jnp.all(jnp.isfinite(starts)) & jnp.all(jnp.diff(breaks) > 0)
+        uniform = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=scaled.dtype)
+        return (
+            z._replace(starts=jnp.where(ok, starts, z.starts)),
+            jnp.where(ok, breaks, uniform),
+        )
 
     def _on_mesh(
         self, problem: Problem, z: Unknowns, breaks: Array, certifier: Any
@@ -241,10 +245,10 @@ class Shooting(eqx.Module):
             y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
             return jax.vmap(lambda y, ts: _dopri8(problem, y, ts))(y, times[index])
 
-        def residual(z: Unknowns, problem: Problem) -> Array:
-            return boundary_residual(problem, z, fly(z, problem)[:, -1])
+        def residual(z: Unknowns, problem: Problem) -> tuple[Array, None]:
+            return boundary_residual(problem, z, fly(z, problem)[:, -1]), None
 
-        z = _newton(residual, z, problem)
+        z, _ = _newton(residual, z, problem)
         arcs = fly(z, problem)
         y = jnp.concatenate([arcs[:, :-1].reshape(-1, arcs.shape[2]), arcs[-1, -1:]])
         t0, tf = horizon(problem, z)
@@ -253,7 +257,7 @@ class Shooting(eqx.Module):
         x, costate = y[:, :n], y[:, n : 2 * n]
         u = jax.vmap(lambda t, x, c: minimising_control(problem, t, x, c))(t, x, costate)
         u = unwrap_angles(problem, t, x, u)
-        worst = jnp.max(jnp.abs(residual(z, problem)))
+        worst = jnp.max(jnp.abs(boundary_residual(problem, z, arcs[:, -1])))
         zeros = lambda k: jnp.zeros((t.shape[0], k), t.dtype)
         size = jax.eval_shape(problem.path_constraints, t[0], x[0], u[0]).shape[0]
         return Extremal(
@@ -263,7 +267,7 @@ class Shooting(eqx.Module):
             reference_nodes=tau,
             costate=costate,
             final_time=tf,
-            objective=_objective(problem, z, arcs[:, -1]),
+            objective=objective(problem, z, arcs[:, -1]),
             multipliers=Multipliers(z.nu, zeros(size), zeros(n), zeros(problem.m)),
             result=_judge(problem, t, x, u, costate, worst),
             residual=worst,
@@ -272,17 +276,19 @@ class Shooting(eqx.Module):
         )
 
 
-def _newton(residual: Any, z: Unknowns, problem: Problem) -> Unknowns:
-    fn = lambda z, problem: residual(z, problem)
-    return optx.root_find(
-        fn,
+def _newton(residual: Any, z: Unknowns, problem: Problem) -> tuple[Unknowns, Any]:
+    """The root, differentiated implicitly, and the residual's auxiliary output near it."""
+    solution = optx.root_find(
+        residual,
         optx.Newton(rtol=1e-12, atol=1e-12, linear_solver=SmallLU()),
         z,
         problem,
+        has_aux=True,
         max_steps=20,
         adjoint=optx.ImplicitAdjoint(linear_solver=SmallLU()),
         throw=False,
-    ).value
+    )
+    return solution.value, solution.aux
 
 
 def _dopri8(problem: Problem, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:
@@ -314,12 +320,6 @@ def _dopri8(problem: Problem, y: Array, times: Float[Array, " k"]) -> Float[Arra
 
     _, ys = jax.lax.scan(step, y, (times[:-1], jnp.diff(times)))
     return jnp.concatenate([y[None], ys])
-
-
-def _objective(problem: Problem, z: Unknowns, ends: Array) -> Array:
-    n = problem.n
-    t0, tf = horizon(problem, z)
-    return problem.endpoint_cost(z.starts[0, :n], ends[-1, :n], t0, tf) + jnp.sum(ends[:, 2 * n])
 
 
 def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"]) -> Array:
