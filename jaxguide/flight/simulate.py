@@ -1,15 +1,15 @@
 """`jg.simulate`: one closed-loop flight, pure, differentiable, and fast under `vmap`."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.flight.integrators import Adaptive, RungeKutta4, barrier, stacked
+from jaxguide.flight.integrators import Adaptive, RungeKutta4, stacked
 from jaxguide.flight.mission import Mission
-from jaxguide.laws.law import Command, SampleGrid
+from jaxguide.laws.law import Command, Law, SampleGrid
 from jaxguide.types import RESULTS
 
 
@@ -38,10 +38,30 @@ class _Carry(eqx.Module):
     result: RESULTS
 
 
-def simulate(mission: Mission, key: Any = None, save: str = "samples") -> Flight:
+class Prepared(NamedTuple):
+    """Sample times of a mission and its law made ready for them: shared by a batch of flights."""
+
+    times: Float[Array, " sample+1"]
+    grid: SampleGrid
+    laws: Law | None
+
+
+def prepare(mission: Mission) -> Prepared:
+    """The part of a fixed-step flight that depends on time alone."""
+    times = sample_times(mission)
+    fixed = isinstance(mission.integrator, RungeKutta4)
+    stages = jnp.asarray(mission.integrator.stages or (0.0, 1.0), times.dtype)
+    grid = SampleGrid(times[:-1], times[:-1, None] + jnp.diff(times)[:, None] * stages[None, :])
+    return Prepared(times, grid, mission.law.prepared(grid) if fixed else None)
+
+
+def simulate(
+    mission: Mission, key: Any = None, save: str = "samples", prepared: Prepared | None = None
+) -> Flight:
     """Flies `mission` once.
 
-    **Arguments:** `key`: a PRNG key, needed only by a sensor; `save`: "samples" or "ends".
+    **Arguments:** `key`: a PRNG key, needed only by a sensor; `save`: "samples" or "ends";
+    `prepared`: `prepare(mission)` if at hand (for batches that share times and law).
 
     **Returns:** a Flight. `.result` is `diverged` where the state left finite numbers (the state is
     then held at its last finite value), `outside_horizon` where the law was asked past its nominal.
@@ -54,20 +74,13 @@ def simulate(mission: Mission, key: Any = None, save: str = "samples") -> Flight
         raise ValueError(f"save is {save!r}; choose 'samples' or 'ends'.")
     if mission.sensor is not None and key is None:
         raise ValueError("simulate: the mission has a sensor, which needs a PRNG key; pass key=.")
-    times = sample_times(mission)
-    law = mission.law
-    fixed = isinstance(mission.integrator, RungeKutta4)
-    stages = jnp.asarray(mission.integrator.stages or (0.0, 1.0), times.dtype)
-    grid = SampleGrid(
-        times[:-1], times[:-1, None] + jnp.diff(times)[:, None] * stages[None, :]
-    )
-    prepared = law.prepared(grid) if fixed else None
-    laws = law if prepared is None else prepared
+    times, grid, laws = prepare(mission) if prepared is None else prepared
+    law, fixed = mission.law, isinstance(mission.integrator, RungeKutta4)
     x0 = mission.initial_state
 
     def sample(carry: _Carry, item: tuple) -> tuple[_Carry, Any]:
         k, t, t_next, stage_times, law_k = item
-        law_k = laws if prepared is None else law_k
+        law_k = law if law_k is None else law_k
         x = jnp.stack(carry.x)
         y, estimate = x, carry.estimate
         if mission.sensor is not None:
@@ -102,8 +115,10 @@ def simulate(mission: Mission, key: Any = None, save: str = "samples") -> Flight
         RESULTS.where(jnp.array(True), RESULTS.successful, RESULTS.successful),
     )
     count = jnp.arange(mission.max_samples)
-    items = (count, times[:-1], times[1:], grid.stages, prepared)
-    end, saved = jax.lax.scan(sample, start, items)
+    items = (count, times[:-1], times[1:], grid.stages, laws)
+    # Checkpointed: reverse mode keeps the state at each sample and flies the sample again.
+    body = jax.checkpoint(sample, prevent_cse=False)  # pyright: ignore
+    end, saved = jax.lax.scan(body, start, items)
     final = jnp.stack(end.x)
     if save == "samples":
         xs, us, dus = saved
@@ -131,10 +146,13 @@ def _fixed(
     stage_times: Array,
     x: tuple[Array, ...],
 ) -> tuple[Array, ...]:
-    controls = _controls(flown, stage_times)
+    nominal, deviation = flown.nominal_on(stage_times), flown.deviation_on(stage_times)
     if mission.last is not None:
-        other = _controls(mission.last(command, t), stage_times)
-        controls = jnp.where(is_last, other, controls)
+        other = mission.last(command, t)
+        choose = lambda a, b: jax.tree_util.tree_map(lambda a, b: jnp.where(is_last, a, b), a, b)
+        full = lambda d: d * (stage_times.shape[0] if len(d) == 1 else 1)
+        nominal = choose(other.nominal_on(stage_times), nominal)
+        deviation = choose(full(other.deviation_on(stage_times)), full(deviation))
     plant, disturbance = mission.plant, mission.disturbance
 
     def rate(t: Any, x: Array, u: Array) -> Array:
@@ -142,12 +160,9 @@ def _fixed(
         return dx if disturbance is None else dx + disturbance(t, x)
 
     assert isinstance(mission.integrator, RungeKutta4)
-    return mission.integrator.across(stacked(rate), t, t_next - t, x, controls)
-
-
-def _controls(command: Command, stage_times: Array) -> Float[Array, "stage m"]:
-    nominal, deviation = command.nominal_on(stage_times), command.deviation_on(stage_times)
-    return nominal + barrier(deviation)
+    return mission.integrator.across(
+        stacked(rate), t, t_next - t, x, nominal, deviation
+    )
 
 
 def _adaptive(

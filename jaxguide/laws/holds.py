@@ -4,10 +4,9 @@ import abc
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.law import Command
+from jaxguide.laws.law import Command, Lanes, lanes
 from jaxguide.types import RESULTS
 
 
@@ -54,11 +53,11 @@ class _HeldDeviation(Command):
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self.du
 
-    def nominal_on(self, times: Array) -> Float[Array, "stage m"]:
+    def nominal_on(self, times: Array) -> tuple[Lanes, ...]:
         return self.command.nominal_on(times)
 
-    def deviation_on(self, times: Array) -> Float[Array, "stage m"]:
-        return jnp.broadcast_to(self.du[None], (times.shape[0], self.du.shape[0]))
+    def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
+        return (lanes(self.du),)
 
 
 class _HeldControl(Command):
@@ -72,3 +71,6 @@ class _HeldControl(Command):
 
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self.du
+
+    def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
+        return (lanes(self.du),)

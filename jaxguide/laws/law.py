@@ -11,6 +11,16 @@ from jaxtyping import Array, Bool, Float
 from jaxguide.types import RESULTS
 
 
+# A vector as a tuple of scalars: under `vmap` each becomes one contiguous array of flights, which
+# is what makes a batch of flights fast on a CPU.
+Lanes = tuple[Any, ...]
+
+
+def lanes(vector: Float[Array, " k"]) -> Lanes:
+    """The entries of `vector`, as a tuple."""
+    return tuple(vector[i] for i in range(vector.shape[0]))
+
+
 class SampleGrid(eqx.Module):
     """Where a fixed-step flight will ask: sample times and the stage times within each sample."""
 
@@ -35,13 +45,13 @@ class Command(eqx.Module):
     def __call__(self, t: Any) -> Float[Array, " m"]:
         return self.nominal(t) + self.deviation(t)
 
-    def nominal_on(self, times: Float[Array, " stage"]) -> Float[Array, "stage m"]:
-        """`nominal` at the stage times of the sample; laws prepared on a grid look it up."""
-        return jax.vmap(self.nominal)(times)
+    def nominal_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
+        """`nominal` at each stage time; laws prepared on a grid look it up."""
+        return tuple(lanes(self.nominal(times[j])) for j in range(times.shape[0]))
 
-    def deviation_on(self, times: Float[Array, " stage"]) -> Float[Array, "stage m"]:
-        """`deviation` at the stage times of the sample."""
-        return jax.vmap(self.deviation)(times)
+    def deviation_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
+        """`deviation` at each stage time; one entry only if it is constant over the sample."""
+        return tuple(lanes(self.deviation(times[j])) for j in range(times.shape[0]))
 
 
 class Law(eqx.Module):

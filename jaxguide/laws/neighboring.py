@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.law import Command, Law, SampleGrid
+from jaxguide.laws.law import Command, Lanes, Law, SampleGrid, lanes
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.types import RESULTS, is_traced
 
@@ -99,7 +99,7 @@ class PreparedNeighboring(Law):
     def __call__(
         self, t_k: Any, x: Float[Array, " n"], memory: None
     ) -> tuple["PreparedCommand", None]:
-        dx = [x[i] - self.x_nominal[i] for i in range(x.shape[0])]
+        dx = tuple(x[i] - self.x_nominal[i] for i in range(x.shape[0]))
         du = _product(self.K, dx)
         du, saturated = _capped(du, self.cap)
         result = RESULTS.where(self.inside, RESULTS.successful, RESULTS.outside_horizon)
@@ -121,16 +121,15 @@ class PreparedCommand(Command):
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self.at_sample
 
-    def nominal_on(self, times: Array) -> Float[Array, "stage m"]:
-        return self.law.u_nominal
+    def nominal_on(self, times: Array) -> tuple[Lanes, ...]:
+        return tuple(lanes(self.law.u_nominal[j]) for j in range(times.shape[0]))
 
-    def deviation_on(self, times: Array) -> Float[Array, "stage m"]:
-        dx = [self.dx[i] for i in range(self.dx.shape[0])]
-        rows = [_product(self.law.maps[j], dx) for j in range(self.law.maps.shape[0])]
-        return _capped(jnp.stack(rows), self.law.cap)[0]
+    def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
+        at = lambda j: _capped(_product(self.law.maps[j], lanes(self.dx)), self.law.cap)[0]
+        return tuple(lanes(at(j)) for j in range(times.shape[0]))
 
 
-def _product(K: Float[Array, "m n"], dx: list[Array]) -> Float[Array, " m"]:
+def _product(K: Float[Array, "m n"], dx: Lanes) -> Float[Array, " m"]:
     """K dx by multiplications and additions: under `vmap` a dot over n lanes is slower."""
     rows = [sum(K[j, i] * dx[i] for i in range(len(dx))) for j in range(K.shape[0])]
     return jnp.stack(rows)

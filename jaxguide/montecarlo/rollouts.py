@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission, with_leaf
-from jaxguide.flight.simulate import Flight, simulate
+from jaxguide.flight.simulate import Flight, Prepared, prepare, simulate
 from jaxguide.montecarlo.dispersions import Distribution
 
 
@@ -47,12 +47,22 @@ def rollouts(
     own `.result`; the others are untouched.
     """
 
+    prepared = shared(mission, dispersions)
+
     def fly(key: Array) -> Flight:
         k_draw, k_noise = jax.random.split(key)
         flown = apply(mission, draw(mission, dispersions, k_draw))
-        return simulate(flown, k_noise, save)
+        return simulate(flown, k_noise, save, prepared)
 
     return jax.vmap(fly)(keys)
+
+
+def shared(mission: Mission, dispersions: dict[str, Distribution]) -> Prepared | None:
+    """What all cases have in common, unless the law or its times are themselves dispersed."""
+    own = ("law", "sample_interval", "initial_time", "final_time")
+    if any(path.split(".")[0] in own for path in dispersions):
+        return None
+    return prepare(mission)
 
 
 def _leaf(mission: Mission, path: str) -> Array:

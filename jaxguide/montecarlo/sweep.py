@@ -13,7 +13,7 @@ from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import simulate
 from jaxguide.montecarlo.covariance import linear_covariance
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import apply, draw
+from jaxguide.montecarlo.rollouts import apply, draw, shared
 from jaxguide.montecarlo.statistics import summarise, wilson_bounds
 from jaxguide.types import RESULTS
 
@@ -135,12 +135,13 @@ def _fly_tile(
     mission: Mission, dispersions: dict[str, Distribution], key: Array, index: Array, tile: int
 ) -> dict[str, Any]:
     cases = index * tile + jnp.arange(tile)
+    prepared = shared(mission, dispersions)
 
     def fly(case: Array) -> dict[str, Any]:
         k_draw, k_noise = jax.random.split(case_key(key, case))
         draws = draw(mission, dispersions, k_draw)
         flown = apply(mission, draws)
-        flight = simulate(flown, k_noise, "ends")
+        flight = simulate(flown, k_noise, "ends", prepared)
         return {
             "initial_state": flown.initial_state,
             "final_state": flight.final_state,

@@ -1,0 +1,385 @@
+"""Figures of extremals, gains, flights and sweeps. Host only; no pyplot, so no display is needed.
+
+Each function returns a `matplotlib.figure.Figure`; `figure.savefig(path, dpi=200)` writes it. Every
+line has its own dash pattern as well as its own colour, so that figures survive a black and white
+printer. `units` maps names of states and controls, and "t", to units shown on the axes.
+"""
+
+import functools as ft
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+Units = Mapping[str, str] | None
+
+# Okabe & Ito's colours, dark ones first: distinct to colour-blind readers, and in grey by dashes.
+COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.5)),
+    (0, (1.2, 1.2)),
+    (0, (6, 1.5, 1.2, 1.5)),
+    (0, (2.5, 1.2)),
+    (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2)),
+    (0, (9, 2)),
+)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+WIDTH = 6.5  # in, the text width of a page
+STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "grid.linewidth": 0.4,
+    "grid.color": "#d0d0d0",
+    "axes.axisbelow": True,
+    "legend.fontsize": 8.0,
+    "legend.framealpha": 0.9,
+    "legend.handlelength": 2.8,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4.0,
+    "axes.formatter.use_mathtext": True,
+    "axes.formatter.limits": (-3, 4),
+    "figure.constrained_layout.use": True,
+}
+_GREEK = {"alpha", "beta", "gamma", "delta", "epsilon", "theta", "phi", "psi", "lambda", "mu"}
+
+
+def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+    """Draws under this module's style, leaving the caller's matplotlib settings alone."""
+
+    @ft.wraps(draw)
+    def call(*args: Any, **options: Any) -> Figure:
+        with mpl.rc_context(STYLE):
+            return draw(*args, **options)
+
+    return call
+
+
+def line(i: int) -> dict[str, Any]:
+    """Colour and dashes of the i-th line."""
+    return {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % len(DASHES)]}
+
+
+def symbol(name: str, prefix: str = "") -> str:
+    """A name as set type: v_r as v with a subscript, greek letters as such, words as words."""
+    head, _, tail = name.partition("_")
+    short = re.fullmatch(r"[A-Za-z]", head) or head in _GREEK
+    if not short or (tail and not re.fullmatch(r"[A-Za-z0-9]{1,3}", tail)):
+        plain = name.replace("_", " ")
+        return rf"${prefix}$ {plain}" if prefix else plain
+    head = rf"\{head}" if head in _GREEK else head
+    tail = rf"_{{{tail}}}" if tail else ""
+    return f"${prefix}{head}{tail}$"
+
+
+def label(name: str, units: Units, prefix: str = "") -> str:
+    """`symbol` with its unit."""
+    unit = (units or {}).get(name, "")
+    return f"{symbol(name, prefix)} [{unit}]" if unit else symbol(name, prefix)
+
+
+def _grid(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, np.ndarray]:
+    figure = Figure(figsize=(WIDTH if columns > 1 else 0.72 * WIDTH, height * rows))
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
+def _time_axis(axes: np.ndarray, units: Units) -> None:
+    for axis in axes[-1]:
+        axis.set_xlabel(label("t", units))
+
+
+def _names(problem: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return tuple(problem.state_names), tuple(problem.control_names)
+
+
+@styled
+def plot_extremal(extremal: Any, units: Units = None) -> Figure:
+    """Control, states and costates of an Extremal (2002 paper, figure 2; the costates beside)."""
+    states, controls = _names(extremal.problem)
+    t = np.asarray(extremal.t)
+    panels = (
+        ("control", np.asarray(extremal.u), controls, ""),
+        ("state", np.asarray(extremal.x), states, ""),
+        ("costate", np.asarray(extremal.costate), states, r"\lambda\ "),
+    )
+    figure, axes = _grid(3, 1, 2.1, sharex=True)
+    for axis, (what, values, names, prefix) in zip(axes[:, 0], panels, strict=True):
+        for i, name in enumerate(names):
+            text = symbol(name) if not prefix else rf"$\lambda$ of {symbol(name)}"
+            unit = "" if prefix else (units or {}).get(name, "")
+            axis.plot(t, values[:, i], label=f"{text} [{unit}]" if unit else text, **line(i))
+        axis.set_ylabel(label(names[0], units) if len(names) == 1 and not prefix else what)
+        if len(names) > 1 or prefix:
+            axis.legend(loc="best")
+    axes[0, 0].set_xlim(t[0], t[-1])
+    _time_axis(axes, units)
+    return figure
+
+
+@styled
+def plot_gains(schedule: Any, units: Units = None) -> Figure:
+    """Gains against time on a symmetric logarithmic scale, and their error estimate below."""
+    states, controls = _names(schedule.extremal.problem)
+    t, K = np.asarray(schedule.times), np.asarray(schedule.K)
+    figure, axes = _grid(len(controls) + 1, 1, 2.3, sharex=True)
+    for i, control in enumerate(controls):
+        axis = axes[i, 0]
+        for j, state in enumerate(states):
+            above, below = symbol(control, r"\partial "), symbol(state, r"\partial ")
+            axis.plot(t, K[:, i, j], label=f"{above} / {below}", **line(j))
+        # Linear up to the median size: gains to a hard end grow without bound.
+        size = np.abs(K[:, i][np.isfinite(K[:, i])])
+        axis.set_yscale("symlog", linthresh=10.0 ** np.round(np.log10(np.median(size) + 1e-300)))
+        axis.set_ylabel(f"gain of {symbol(control)}")
+        axis.legend(loc="best")
+    error = np.asarray(schedule.error)
+    resolved = np.asarray(schedule.resolved)
+    below = axes[-1, 0]
+    below.semilogy(t, np.maximum(error, 1e-17), **line(0))
+    if not resolved.all():
+        below.semilogy(
+            t[~resolved], error[~resolved], "x", color=COLOURS[2], label="not resolved"
+        )
+        below.legend(loc="best")
+    below.set_ylabel("relative error, estimated")
+    axes[0, 0].set_xlim(t[0], float(np.asarray(schedule.extremal.t)[-1]))
+    _time_axis(axes, units)
+    return figure
+
+
+@styled
+def plot_flight(flight: Any, extremal: Any, units: Units = None) -> Figure:
+    """States and controls of one Flight over its nominal (left), and their difference (right)."""
+    states, controls = _names(extremal.problem)
+    t, x = np.asarray(flight.t), np.asarray(flight.x)
+    x_nominal, u_nominal = at(extremal, t)
+    u, du = np.asarray(flight.u), np.asarray(flight.commands)
+    figure, axes = _grid(len(states) + len(controls), 2, 1.45, sharex=True)
+    rows = [(name, x[:, i], x_nominal[:, i], None) for i, name in enumerate(states)]
+    rows += [(name, u[:, i], u_nominal[:, i], du[:, i]) for i, name in enumerate(controls)]
+    for (left, right), (name, flown, nominal, deviation) in zip(axes, rows, strict=True):
+        left.plot(t, nominal, label="nominal", **line(1))
+        left.plot(t[: len(flown)], flown, label="flown", **line(0))
+        left.set_ylabel(label(name, units))
+        if deviation is None:
+            right.plot(t, flown - nominal, **line(0))
+        else:
+            right.step(t[:-1], deviation, where="post", **line(0))
+        right.set_ylabel(label(name, units, r"\delta "))
+    axes[0, 0].legend(loc="best")
+    axes[0, 0].set_xlim(t[0], t[-1])
+    _time_axis(axes, units)
+    return figure
+
+
+@styled
+def plot_deviations(
+    flights: Any,
+    extremal: Any,
+    name: str,
+    labels: Sequence[str] | None = None,
+    units: Units = None,
+) -> Figure:
+    """Deviation of one state, or of one control, from the nominal (2002 paper, figures 3 to 6).
+
+    **Arguments:** `flights`: a Flight whose arrays have a leading case axis; `name`: of a state or
+    a control; `labels`: of the cases.
+
+    **Raises:** `ValueError` for a name that is neither.
+    """
+    states, controls = _names(extremal.problem)
+    t = np.asarray(flights.t)[0]
+    if name in states:
+        i = states.index(name)
+        values = np.asarray(flights.x)[:, :, i] - at(extremal, t)[0][None, :, i]
+    elif name in controls:
+        t = t[:-1]
+        values = np.asarray(flights.commands)[:, :, controls.index(name)]
+    else:
+        raise ValueError(f"{name!r} is no state {states} and no control {controls}.")
+    return _cases(t, values, label(name, units, r"\delta "), labels, units)
+
+
+@styled
+def plot_reoptimised(
+    flights: Any,
+    reoptimised: np.ndarray,
+    name: str,
+    state_names: Sequence[str],
+    labels: Sequence[str] | None = None,
+    units: Units = None,
+) -> Figure:
+    """Flown minus re-optimised state (2002 paper, figures 7 to 9).
+
+    **Arguments:** `flights`: a Flight with a leading case axis; `reoptimised` (case, sample+1, n):
+    states, at the same times, of the extremals from the perturbed starts; `name`: of a state.
+    """
+    states = tuple(state_names)
+    if name not in states:
+        raise ValueError(f"{name!r} is no state; there are {states}.")
+    i = states.index(name)
+    values = np.asarray(flights.x)[:, :, i] - np.asarray(reoptimised)[:, :, i]
+    quantity = f"{symbol(name)} $-$ {symbol(name)} re-optimised"
+    unit = (units or {}).get(name, "")
+    text = f"{quantity} [{unit}]" if unit else quantity
+    return _cases(np.asarray(flights.t)[0], values, text, labels, units)
+
+
+def _cases(
+    t: np.ndarray, values: np.ndarray, text: str, labels: Sequence[str] | None, units: Units
+) -> Figure:
+    labels = [f"case {k + 1}" for k in range(len(values))] if labels is None else labels
+    figure, axes = _grid(1, 1, 3.0)
+    axis = axes[0, 0]
+    axis.axhline(0.0, color="#808080", linewidth=0.6)
+    for k, (row, text_k) in enumerate(zip(values, labels, strict=True)):
+        axis.plot(t, row, label=text_k, **line(k))
+    axis.set_xlim(t[0], t[-1])
+    axis.set_xlabel(label("t", units))
+    axis.set_ylabel(text)
+    axis.legend(loc="best", ncols=2 if len(labels) > 3 else 1)
+    return figure
+
+
+@styled
+def plot_gain_errors(
+    errors: Mapping[str, Mapping[str, tuple[Any, Any]]],
+    abscissa: str = "collocation points",
+    ordinate: str = "error of the gain, relative",
+) -> Figure:
+    """Error of gains against the size of the discretisation, one panel for each time.
+
+    **Arguments:** `errors`: panel title -> method -> (points, errors).
+    """
+    figure, axes = _grid(1, len(errors), 3.0, sharey=True)
+    for axis, (title, methods) in zip(axes[0], errors.items(), strict=True):
+        for k, (method, (points, values)) in enumerate(methods.items()):
+            values = np.maximum(np.asarray(values, float), 1e-17)
+            axis.loglog(points, values, marker=MARKERS[k], label=method, **line(k))
+        axis.set_title(title)
+        axis.set_xlabel(abscissa)
+        ticks = sorted({int(p) for points, _ in methods.values() for p in points})
+        ticks = [p for p in ticks if (p & (p - 1)) == 0] or ticks  # powers of two stay legible
+        axis.set_xticks(ticks, [str(p) for p in ticks])
+        axis.minorticks_off()
+    axes[0, 0].set_ylabel(ordinate)
+    axes[0, 0].legend(loc="best")
+    return figure
+
+
+@styled
+def plot_sweep(dataset: Any, units: Units = None) -> Figure:
+    """Final states of a sweep: histograms on the diagonal, pairs below it.
+
+    The pairs carry three-sigma ellipses of the sampled covariance and, dashed, of the linear one;
+    the histograms, the 1st, 50th and 99th percentiles. Failed cases are counted in the title.
+    """
+    names = [str(s) for s in np.asarray(dataset["state"])]
+    good = np.isfinite(np.asarray(dataset["final_state"])).all(axis=1)
+    good &= np.asarray(dataset["result"]) == 0
+    finals = np.asarray(dataset["final_state"], float)[good]
+    attrs = dataset.attrs
+    n = len(names)
+    figure = Figure(figsize=(WIDTH, 0.86 * WIDTH))
+    axes = figure.subplots(n, n, squeeze=False)
+    # Final states scatter by little about large values: show them from the undispersed end.
+    nominal = np.asarray(attrs["nominal_final_state"], float)
+    values = finals - nominal[None, :]
+    sampled = np.asarray(attrs["sample_covariance"], float)
+    linear = np.asarray(attrs["linear_covariance"], float)
+    mean = values.mean(axis=0) if len(values) else np.zeros(n)
+    for i in range(n):
+        for j in range(n):
+            axis: Axes = axes[i, j]
+            if j > i:
+                axis.set_visible(False)
+            elif j == i:
+                _histogram(axis, values[:, i])
+                axis.yaxis.tick_right()
+            elif len(values):
+                axis.plot(
+                    values[:, j], values[:, i], ".", color="#9a9a9a", markersize=1.5, alpha=0.4,
+                    markeredgewidth=0, rasterized=True, zorder=1,
+                )  # fmt: skip
+                pair = np.ix_([j, i], [j, i])
+                _ellipse(axis, mean[[j, i]], sampled[pair], label="sampled", **line(0))
+                _ellipse(axis, np.zeros(2), linear[pair], label="linear", **line(2))
+            if i == n - 1:
+                axis.set_xlabel(label(names[j], units, r"\delta "))
+            elif j < i:
+                axis.tick_params(labelbottom=False)
+            if j == 0 and i > 0:
+                axis.set_ylabel(label(names[i], units, r"\delta "))
+            elif 0 < j < i:
+                axis.tick_params(labelleft=False)
+            axis.locator_params(nbins=4)
+    for j in range(n):  # columns share their abscissa with the histogram above
+        low, high = axes[j, j].get_xlim()
+        for i in range(j + 1, n):
+            axes[i, j].set_xlim(low, high)
+    handles: dict[str, Any] = {}
+    for axis in axes.ravel():
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    if handles:
+        figure.legend(
+            list(handles.values()), list(handles), loc="upper right", bbox_to_anchor=(0.98, 0.93)
+        )
+    rate = f"{int(good.sum()):,} of {good.size:,} flights successful"
+    figure.suptitle(f"Final state minus that of the undispersed flight; {rate}", fontsize=9.0)
+    return figure
+
+
+def _histogram(axis: Axes, values: np.ndarray) -> None:
+    if not len(values):
+        return
+    axis.hist(
+        values, bins=60, color="#c8d8e8", edgecolor="#5a6a7a", linewidth=0.2, histtype="stepfilled"
+    )
+    for k, percent in enumerate((1.0, 50.0, 99.0)):
+        at_percent = np.percentile(values, percent)
+        axis.axvline(at_percent, label=f"{percent:g} %", linewidth=1.0, **line(k + 3))
+    axis.grid(False)
+
+
+def _ellipse(axis: Axes, centre: np.ndarray, covariance: np.ndarray, **options: Any) -> None:
+    """Three-sigma ellipse of a 2 x 2 covariance."""
+    size, vectors = np.linalg.eigh(covariance)
+    width, height = 6 * np.sqrt(np.maximum(size[::-1], 0.0))
+    angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+    x, y = (float(c) for c in centre)
+    text = f"3 sigma, {options.pop('label')}"
+    axis.add_patch(
+        Ellipse((x, y), width, height, angle=angle, fill=False, label=text, lw=1.3, **options)
+    )
+    axis.autoscale_view()
+
+
+def at(extremal: Any, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States and controls of an Extremal at `t`, interpolated on the host in the Extremal's own
+    piecewise polynomials: a figure should not cost a compilation."""
+    nodes, x, u = (np.asarray(a) for a in (extremal.t, extremal.x, extremal.u))
+    degree = len(np.asarray(extremal.reference_nodes)) - 1
+    values = np.concatenate([x, u], axis=1)
+    out = np.empty((len(t), values.shape[1]))
+    breaks = nodes[::degree]
+    segment = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
+    for s in np.unique(segment):
+        own = slice(s * degree, (s + 1) * degree + 1)
+        # A difference table in the shifted variable would do as well; barycentric is shorter.
+        local = nodes[own]
+        span = local[-1] - local[0]
+        gaps = (local[:, None] - local[None, :]) / span + np.eye(degree + 1)
+        weights = 1 / np.prod(4 * gaps, axis=1)
+        here = np.flatnonzero(segment == s)
+        away = (np.clip(t[here], nodes[0], nodes[-1])[:, None] - local[None, :]) / span
+        hit = np.abs(away) < 1e-14
+        terms = np.where(hit.any(axis=1)[:, None], hit, weights / np.where(hit, 1.0, away))
+        out[here] = (terms / terms.sum(axis=1, keepdims=True)) @ values[own]
+    return out[:, : x.shape[1]], out[:, x.shape[1] :]
