@@ -1,3 +1,10 @@
+"""Settings of every test, and the solved problems that tests share: each costs seconds to compile,
+so tests perturb these (`dataclasses.replace` keeps the compiled program) and make few of their own.
+"""
+
+import json
+from pathlib import Path
+
 import jax
 import matplotlib
 
@@ -5,3 +12,169 @@ matplotlib.use("Agg")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+import jax.numpy as jnp  # noqa: E402
+import jaxguide as jg  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+from jaxguide.problems.earth_mars import EarthMars  # noqa: E402
+
+# Few starts, one coarse mesh: enough for problems whose extremal is unique and smooth.
+SMALL = jg.Shooting(arcs=2, segments=8, starts=4)
+
+
+class DoubleIntegrator(jg.Problem):
+    """x'' = k u, J = int u^2/2, to `target`. From rest over unit distance and time with k = 1:
+    u = 6 - 12 t, J = 6; the gain is (-6/T^2, -4/T), T the time left."""
+
+    k: float = 1.0
+    target: tuple = (1.0, 0.0)
+    state_names = ("x", "v")
+    control_names = ("u",)
+    initial_state = (0.0, 0.0)
+
+    def dynamics(self, t, x, u):
+        return jnp.stack([x[1], self.k * u[0]])
+
+    def running_cost(self, t, x, u):
+        return 0.5 * u[0] ** 2
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return xf - jnp.stack([jnp.asarray(v, xf.dtype) for v in self.target])
+
+
+class FreeTime(DoubleIntegrator):
+    """As above with J = int (1 + u^2/2) and the final time free: tf = 18^(1/4) from rest."""
+
+    final_time = jg.Free(0.2, 20.0, 2.0)
+
+    def running_cost(self, t, x, u):
+        return 1.0 + 0.5 * u[0] ** 2
+
+
+class ScalarLQR(jg.Problem):
+    """x' = a x + u, J = s x_f^2/2 + int (q x^2 + u^2)/2, no endpoint constraint: K = -S(t), S the
+    solution of the scalar Riccati equation."""
+
+    a: float = 0.5
+    q: float = 2.0
+    s: float = 0.3
+    state_names = ("x",)
+    control_names = ("u",)
+    final_time = 1.5
+    initial_state = (1.0,)
+
+    def dynamics(self, t, x, u):
+        return self.a * x + u
+
+    def running_cost(self, t, x, u):
+        return 0.5 * (self.q * x[0] ** 2 + u[0] ** 2)
+
+    def endpoint_cost(self, x0, xf, t0, tf):
+        return 0.5 * self.s * xf[0] ** 2
+
+
+class Regulator(jg.Problem):
+    """Two uncoupled x_i' = a_i x_i + u_i to 0, J = int sum (q_i x_i^2 + r_i u_i^2)/2.
+
+    With r = 1 and w = sqrt(a^2 + q): K_i = -(a_i + w_i coth(w_i T)); for a = 0, q = -w^2 it is
+    -w cot(w T), with a conjugate point at T = pi/w.
+    """
+
+    a: jax.Array = np.array([0.0, 0.0])
+    q: jax.Array = np.array([0.0, 0.0])
+    r: jax.Array = np.array([1.0, 1.0])
+    state_names = ("x", "y")
+    control_names = ("u", "v")
+    initial_state = (1.0, 0.5)
+
+    def dynamics(self, t, x, u):
+        return self.a * x + u
+
+    def running_cost(self, t, x, u):
+        return 0.5 * jnp.sum(self.q * x**2 + self.r * u**2)
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return xf
+
+
+class Zermelo(jg.Problem):
+    """Shortest time across the shear current (-V y/h, 0) to the origin, heading free.
+
+    **Source:** Bryson & Ho (1975), section 2.7, example 1, whose solution is in closed form.
+    """
+
+    V: float = 1.0
+    h: float = 1.0
+    state_names = ("x", "y")
+    control_names = ("heading",)
+    initial_state = (3.66, -1.86)
+    final_time = jg.Free(0.5, 20.0, 4.0)
+
+    def dynamics(self, t, x, u):
+        current = -self.V * x[1] / self.h
+        return jnp.stack([self.V * jnp.cos(u[0]) + current, self.V * jnp.sin(u[0])])
+
+    def running_cost(self, t, x, u):
+        return jnp.ones(())
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return xf
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """Numbers computed without this package: its H is maximised, so costates change sign here."""
+    path = Path(__file__).parent / "data" / "earth_mars.json"
+    if not path.exists():
+        path = Path("/work/shared/reference/earth_mars.json")
+    return json.loads(path.read_text())
+
+
+@pytest.fixture(scope="session")
+def earth_mars():
+    return jg.solve(EarthMars(), jg.Shooting(starts=8))
+
+
+@pytest.fixture(scope="session")
+def double_integrator():
+    return jg.solve(DoubleIntegrator(), SMALL)
+
+
+@pytest.fixture(scope="session")
+def free_time():
+    return jg.solve(FreeTime(), SMALL)
+
+
+@pytest.fixture(scope="session")
+def scalar_lqr():
+    return jg.solve(ScalarLQR(), SMALL)
+
+
+@pytest.fixture(scope="session")
+def regulator():
+    return jg.solve(Regulator(), SMALL)
+
+
+@pytest.fixture(scope="session")
+def zermelo():
+    return jg.solve(Zermelo(), jg.Shooting(arcs=2, segments=16, starts=16))
+
+
+@pytest.fixture(scope="session")
+def schedule(earth_mars):
+    """The paper's 166 samples."""
+    return jg.gain_schedule(earth_mars, np.arange(166) * 0.02)
+
+
+@pytest.fixture
+def compilations():
+    """Counts XLA compilations since the test began; call it."""
+    count = [0]
+
+    def listen(event, duration, **kwargs):
+        count[0] += event == "/jax/core/compile/backend_compile_duration"
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield lambda: count[0]
+    jax.monitoring.unregister_event_duration_listener(listen)

@@ -52,7 +52,8 @@ def prepare(mission: Mission) -> Prepared:
     fixed = isinstance(mission.integrator, RungeKutta4)
     stages = jnp.asarray(mission.integrator.stages or (0.0, 1.0), times.dtype)
     grid = SampleGrid(times[:-1], times[:-1, None] + jnp.diff(times)[:, None] * stages[None, :])
-    return Prepared(times, grid, mission.law.prepared(grid) if fixed else None)
+    histories = any(hold is not None and hold.uses_history for hold in (mission.hold, mission.last))
+    return Prepared(times, grid, mission.law.prepared(grid, histories) if fixed else None)
 
 
 def simulate(

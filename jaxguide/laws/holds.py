@@ -1,7 +1,7 @@
 """What is flown of a command until the next sample."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
@@ -13,6 +13,8 @@ from jaxguide.types import RESULTS
 class Hold(eqx.Module):
     """Turns a law's command into what the vehicle does over the sample that begins at `t_k`."""
 
+    uses_history: ClassVar[bool] = False  # whether the command's deviation is asked after t_k
+
     @abc.abstractmethod
     def __call__(self, command: Command, t_k: Any) -> Command:
         """The command as flown."""
@@ -20,6 +22,8 @@ class Hold(eqx.Module):
 
 class History(Hold):
     """The law's own open-loop history of the deviation (2002 paper, eq. 49)."""
+
+    uses_history: ClassVar[bool] = True
 
     def __call__(self, command: Command, t_k: Any) -> Command:
         return command

@@ -65,11 +65,12 @@ class Law(eqx.Module):
     def __call__(self, t_k: Any, x: Float[Array, " n"], memory: Any) -> tuple[Command, Any]:
         """The command from `t_k` on, given the measured state; and the new memory."""
 
-    def prepared(self, grid: SampleGrid) -> "Law | None":
+    def prepared(self, grid: SampleGrid, histories: bool) -> "Law | None":
         """The law with a leading sample axis on every leaf, its time-dependent work done.
 
         All flights of a batch share their sample times, so gains and nominal are worth looking up
-        once. None (the default): nothing to prepare.
+        once. `histories`: whether `deviation_on` will be asked (a hold of the deviation asks only
+        for its value at the sample). None (the default): nothing to prepare.
         """
         return None
 

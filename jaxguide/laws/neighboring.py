@@ -47,19 +47,21 @@ class NeighboringOptimal(Law):
     def _gain(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         return self.scale * self.schedule.history(t_k, t)
 
-    def prepared(self, grid: SampleGrid) -> "PreparedNeighboring":
+    def prepared(self, grid: SampleGrid, histories: bool) -> "PreparedNeighboring":
         extremal = self.schedule.extremal
         # Past the last gain (samples beyond the end of the flight have no length) hold it.
         times = jnp.minimum(grid.times, self.schedule.times[-1])
         stages = grid.stages
         K = jax.vmap(self.schedule)(times)
-        maps = jax.vmap(lambda t_k, ts: jax.vmap(lambda t: self._gain(t_k, t))(ts))
-        ends = jnp.maximum(stages, times[:, None])
+        maps = None
+        if histories:
+            at_stages = jax.vmap(lambda t_k, ts: jax.vmap(lambda t: self._gain(t_k, t))(ts))
+            maps = at_stages(times, jnp.maximum(stages, times[:, None]))
         return PreparedNeighboring(
             extremal(grid.times).x,
             self.scale * K,
             jax.vmap(lambda ts: extremal(ts).u)(stages),
-            maps(times, ends),
+            maps,
             jnp.broadcast_to(jnp.asarray(self.cap, K.dtype), (grid.times.shape[0],)),
             grid.times < extremal.t[-1],
         )
@@ -89,7 +91,7 @@ class PreparedNeighboring(Law):
     x_nominal: Float[Array, "*k n"]
     K: Float[Array, "*k m n"]
     u_nominal: Float[Array, "*k stage m"]
-    maps: Float[Array, "*k stage m n"]
+    maps: Float[Array, "*k stage m n"] | None
     cap: Float[Array, "*k"]
     inside: Bool[Array, "*k"]
 
@@ -125,7 +127,9 @@ class PreparedCommand(Command):
         return tuple(lanes(self.law.u_nominal[j]) for j in range(times.shape[0]))
 
     def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
-        at = lambda j: _capped(_product(self.law.maps[j], lanes(self.dx)), self.law.cap)[0]
+        maps = self.law.maps
+        assert maps is not None
+        at = lambda j: _capped(_product(maps[j], lanes(self.dx)), self.law.cap)[0]
         return tuple(lanes(at(j)) for j in range(times.shape[0]))
 
 
