@@ -134,9 +134,7 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
 
     if costly:
         flown = _propagate(extremal)
-        rows.add(
-            "propagated state", states, (flown - x) / (1e-3 + span)[None], t, 1e-8
-        )
+        rows.add("propagated state", states, (flown - x) / (1e-3 + span)[None], t, 1e-8)
 
     # Canonical equations, eqs (2) and (6), in integral form on Gauss points between the nodes.
     gauss, weights = (jnp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
@@ -168,10 +166,10 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
         problem, extremal.multipliers.endpoint, x0, xf, t0, tf
     )
     free_mask = jnp.asarray(free)
+    rows.add("initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], 1e-9)
     rows.add(
-        "initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], 1e-9
+        "transversality, end", costates, ((costate[-1] - g[1]) / lam_span)[None], tf[None], 1e-9
     )
-    rows.add("transversality, end", costates, ((costate[-1] - g[1]) / lam_span)[None], tf[None], 1e-9)
     if any(free):
         gap = jnp.where(free_mask, costate[0] + g[0], 0.0) / lam_span
         rows.add("transversality, start", costates, gap[None], t0[None], 1e-9)
@@ -180,7 +178,9 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     h_node = jax.vmap(hamiltonian, in_axes=(None, 0, 0, 0, 0))(problem, t, x, u, costate)
     h_scale = 1e-3 * lam_span + jnp.max(jnp.abs(h_node))
     if is_free(problem.final_time):
-        rows.add("H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], 1e-9)
+        rows.add(
+            "H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], 1e-9
+        )
     h_t = over(jax.grad(hamiltonian, argnums=1))(times, gx, gu, glam)
     drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
     gap = (h_node[step::step] - h_node[0] - drift) / h_scale
@@ -200,7 +200,12 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     for name, labels, values, bounds in (
         ("state bounds", states, x, problem.state_bounds),
         ("control bounds", problem.control_names, u, problem.control_bounds),
-        ("path constraints", None, jax.vmap(problem.path_constraints)(t, x, u), problem.path_bounds),
+        (
+            "path constraints",
+            None,
+            jax.vmap(problem.path_constraints)(t, x, u),
+            problem.path_bounds,
+        ),
     ):
         lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
         over_by = jnp.maximum(lo[None] - values, 0.0) + jnp.maximum(values - hi[None], 0.0)
@@ -211,9 +216,10 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     p = extremal.reference_nodes.shape[0]
     vandermonde = np.polynomial.legendre.legvander(nodes_lgl(p)[0], p - 1)
     inverse = jnp.asarray(np.linalg.inv(vandermonde), t.dtype)[-2:]
-    tail = lambda v, s: jnp.max(
-        jnp.abs(jnp.einsum("rp,spk->srk", inverse, extremal.by_segment(v))), axis=1
-    ) / (s if jnp.ndim(s) else s * jnp.ones(v.shape[1], v.dtype))[None]
+    tail = lambda v, s: (
+        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", inverse, extremal.by_segment(v))), axis=1)
+        / (s if jnp.ndim(s) else s * jnp.ones(v.shape[1], v.dtype))[None]
+    )
     rows.add("spectral tail, state", states, tail(x, 1e-3 + span), breaks[1:], 1e-9)
     rows.add("spectral tail, costate", costates, tail(costate, lam_span), breaks[1:], 1e-9)
     return rows.done()

@@ -218,9 +218,8 @@ def gains(
     import jaxguide as jg
 
     times = jnp.linspace(extremal.t[0], extremal.final_time, count, endpoint=False)
-    options = {"method": method} | ({} if nodes is None else {"nodes": nodes})
     with waiting(RichProgress(f"gains {name}")):
-        schedule = jg.gain_schedule(extremal, times, **options)
+        schedule = jg.gain_schedule(extremal, times, method=method, nodes=nodes)
         resolved = [bool(r) for r in schedule.resolved]
     figures = []
     if out is not None:

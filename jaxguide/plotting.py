@@ -144,9 +144,7 @@ def plot_gains(schedule: Any, units: Units = None) -> Figure:
     below = axes[-1, 0]
     below.semilogy(t, np.maximum(error, 1e-17), **line(0))
     if not resolved.all():
-        below.semilogy(
-            t[~resolved], error[~resolved], "x", color=COLOURS[2], label="not resolved"
-        )
+        below.semilogy(t[~resolved], error[~resolved], "x", color=COLOURS[2], label="not resolved")
         below.legend(loc="best")
     below.set_ylabel("relative error, estimated")
     axes[0, 0].set_xlim(t[0], float(np.asarray(schedule.extremal.t)[-1]))

@@ -77,7 +77,9 @@ class Problem(eqx.Module):
             options: dict[str, Any] = {"kw_only": base.kw_only}
             if base.metadata.get("static", False):
                 options["static"] = True
-            if type(value).__hash__ is None:  # arrays and lists: dataclasses refuses them as default
+            if (
+                type(value).__hash__ is None
+            ):  # arrays and lists: dataclasses refuses them as default
                 setattr(cls, name, eqx.field(default_factory=lambda v=value: v, **options))
             else:
                 setattr(cls, name, eqx.field(default=value, **options))

@@ -13,9 +13,7 @@ from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
 
-def solve(
-    problem: Problem, method: Any = None, guess: Any = None, throw: bool = True
-) -> Extremal:
+def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool = True) -> Extremal:
     """Solves `problem` for an extremal that carries its own certificate.
 
     **Arguments:**
@@ -54,9 +52,7 @@ def raise_if_failed(extremal: Extremal) -> None:
     problem = extremal.problem
     message = [f"{type(problem).__name__}: {RESULTS[extremal.result]}"]
     e = np.asarray(
-        problem.endpoint_constraints(
-            extremal.x[0], extremal.x[-1], extremal.t[0], extremal.t[-1]
-        )
+        problem.endpoint_constraints(extremal.x[0], extremal.x[-1], extremal.t[0], extremal.t[-1])
     )
     lo, hi = (np.broadcast_to(np.asarray(b, float), e.shape) for b in problem.endpoint_bounds)
     miss = np.maximum(lo - e, 0) + np.maximum(e - hi, 0)

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 import diffrax
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 

@@ -127,7 +127,9 @@ class Mission(eqx.Module):
 
 def _sample_count(interval: float, t0: float, tf: float) -> int:
     if not (math.isfinite(t0) and math.isfinite(tf)) or not tf > t0:
-        raise ValueError(f"Mission: the horizon [{t0}, {tf}] must be finite and of positive length.")
+        raise ValueError(
+            f"Mission: the horizon [{t0}, {tf}] must be finite and of positive length."
+        )
     if not interval > 0 or not math.isfinite(interval):
         raise ValueError(f"Mission: sample_interval is {interval}; give a positive number.")
     if interval > (tf - t0) * (1 + 1e-12):

@@ -161,9 +161,7 @@ def _fixed(
         return dx if disturbance is None else dx + disturbance(t, x)
 
     assert isinstance(mission.integrator, RungeKutta4)
-    return mission.integrator.across(
-        stacked(rate), t, t_next - t, x, nominal, deviation
-    )
+    return mission.integrator.across(stacked(rate), t, t_next - t, x, nominal, deviation)
 
 
 def _adaptive(

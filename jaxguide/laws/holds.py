@@ -33,7 +33,12 @@ class HoldDeviation(Hold):
     """Zero-order hold of the deviation: u = u*(t) + du(t_k)."""
 
     def __call__(self, command: Command, t_k: Any) -> Command:
-        return _HeldDeviation(command, command.deviation(t_k), command.result, command.saturated)
+        return _HeldDeviation(
+            command=command,
+            du=command.deviation(t_k),
+            result=command.result,
+            saturated=command.saturated,
+        )
 
 
 class HoldControl(Hold):
@@ -41,7 +46,10 @@ class HoldControl(Hold):
 
     def __call__(self, command: Command, t_k: Any) -> Command:
         return _HeldControl(
-            command.nominal(t_k), command.deviation(t_k), command.result, command.saturated
+            u=command.nominal(t_k),
+            du=command.deviation(t_k),
+            result=command.result,
+            saturated=command.saturated,
         )
 
 

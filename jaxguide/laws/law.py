@@ -4,12 +4,10 @@ import abc
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.types import RESULTS
-
 
 # A vector as a tuple of scalars: under `vmap` each becomes one contiguous array of flights, which
 # is what makes a batch of flights fast on a CPU.
@@ -84,7 +82,10 @@ class OpenLoop(Law):
         return None
 
     def __call__(self, t_k: Any, x: Array, memory: None) -> tuple[Command, None]:
-        return NominalCommand(self.extremal, RESULTS.successful, jnp.array(False)), None
+        command = NominalCommand(
+            extremal=self.extremal, result=RESULTS.successful, saturated=jnp.array(False)
+        )
+        return command, None
 
 
 class NominalCommand(Command):

@@ -28,7 +28,9 @@ class NeighboringOptimal(Law):
 
     def __check_init__(self):
         if not is_traced(self.cap) and not np.all(np.asarray(self.cap) > 0):
-            raise ValueError(f"NeighboringOptimal: cap is {self.cap}; give a positive bound on |du|.")
+            raise ValueError(
+                f"NeighboringOptimal: cap is {self.cap}; give a positive bound on |du|."
+            )
 
     def start(self, x0: Float[Array, " n"]) -> None:
         return None
@@ -42,7 +44,9 @@ class NeighboringOptimal(Law):
         inside = (t_k >= schedule.extremal.t[0]) & (t_k < schedule.extremal.t[-1])
         result = RESULTS.where(inside, RESULTS.successful, RESULTS.outside_horizon)
         _, saturated = _capped(self._gain(t_k, t_k).astype(x.dtype) @ dx, self.cap)
-        return NeighboringCommand(self, t_k, dx, result, saturated), None
+        return NeighboringCommand(
+            law=self, t_k=t_k, dx=dx, result=result, saturated=saturated
+        ), None
 
     def _gain(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         return self.scale * self.schedule.history(t_k, t)
@@ -105,7 +109,9 @@ class PreparedNeighboring(Law):
         du = _product(self.K, dx)
         du, saturated = _capped(du, self.cap)
         result = RESULTS.where(self.inside, RESULTS.successful, RESULTS.outside_horizon)
-        return PreparedCommand(self, jnp.stack(dx), du, result, saturated), None
+        return PreparedCommand(
+            law=self, dx=jnp.stack(dx), at_sample=du, result=result, saturated=saturated
+        ), None
 
 
 class PreparedCommand(Command):

@@ -82,5 +82,3 @@ def _hash(path: str) -> int:
     for byte in path.encode():
         value = (value * 131 + byte) % (2**31 - 1)
     return value
-
-

@@ -50,8 +50,8 @@ def sweep(
     the mission's own); `progress`: an object with init, step, close; `store`, `scheduler`: not
     yet; must be None.
 
-    **Returns:** variables `initial_state`, `final_state` (case, state), `result` (case,), `draw:path`
-    for every dispersed leaf; attributes `rollouts_per_s` (warm), `compile_s`, `percentiles` (with
+    **Returns:** variables `initial_state`, `final_state` (case, state), `result` (case,), and
+    `draw:path` for every dispersed leaf; attributes `rollouts_per_s` (warm), `compile_s`, `percentiles` (with
     confidence bounds), `success_rate` with Wilson bounds, `failures`, and the linear covariance
     beside the sampled one.
 

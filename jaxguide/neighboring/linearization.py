@@ -1,4 +1,4 @@
-"""The linear two-point boundary-value problem about an extremal, paper eqs (11)-(21), by autodiff."""
+"""The linear two-point boundary-value problem about an extremal, eqs (11)-(21), by autodiff."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -152,7 +152,14 @@ def terminal_conditions(extremal: Extremal, parameters: tuple[str, ...] = ()) ->
         return jnp.concatenate(rows)
 
     z = jnp.concatenate(
-        [xf, costate, parameter_values(problem, parameters, dtype), jnp.zeros(q, dtype), nu, tf[None]]
+        [
+            xf,
+            costate,
+            parameter_values(problem, parameters, dtype),
+            jnp.zeros(q, dtype),
+            nu,
+            tf[None],
+        ]
     )
     jac = jax.jacfwd(conditions)(z)
     known, unknown = jac[:, : 2 * n + p + q], jac[:, 2 * n + p + q : -1]

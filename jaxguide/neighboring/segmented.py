@@ -4,7 +4,7 @@ The adjoint rows $G(t) = [G_x\ G_\lambda]$ of the end conditions, $\dot G = -G M
 $G(t_f) = [\psi_x\ \psi_\lambda]$, annihilate every neighbouring extremal: $G y = 0$ at all times,
 so $\delta\lambda = S\,\delta x$ with $S = -G_\lambda^{-1} G_x$. Unlike a Riccati sweep nothing is
 infinite at a hard end. On each segment the transition matrix is collocated at Gauss points in
-integral form (which superconverges) by Picard sweeps, all segments at once; a short scan joins them.
+integral form (which superconverges) by Picard sweeps, all segments at once, then joined.
 
 Arrays run (node, row, column, segment): the batch is last, so that small products vectorise.
 """
@@ -22,7 +22,6 @@ from jaxguide.neighboring.linearization import (
     Terminal,
     canonical,
     second_variation,
-    terminal_conditions,
 )
 from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
@@ -62,7 +61,6 @@ class Sweep(NamedTuple):
         """G(t), scaled."""
         i = self.locate(t)
         two_n = self.scale.shape[0]
-        b = self.breaks[i + 1]
         end = self.ends[i]
         carried = self.transition(i, t) - _identity((two_n, end.shape[1]), end.dtype)
         return end + end[:, :two_n] @ carried
@@ -270,7 +268,9 @@ def solve_sweeps(
         for i, slopes in enumerate((slopes1, slopes2))
     ]
     at_times = jax.tree_util.tree_map(lambda a: a[second:], c)
-    return Pair(*pair, at_times, jnp.all(convex[:first].reshape(counts[0], segments), axis=0))
+    return Pair(
+        pair[0], pair[1], at_times, jnp.all(convex[:first].reshape(counts[0], segments), axis=0)
+    )
 
 
 def _probe_times(extremal: Extremal) -> Array:
@@ -310,7 +310,11 @@ def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> Gains:
     width = jnp.concatenate([sweep.scale[:n], jnp.ones(known.shape[1] - n, G.dtype)])
     S = sweep.scale[n:, None] * S / width[None, :]
     direct = jnp.concatenate(
-        [c.U[:, :n], c.U_p, jnp.zeros((c.U.shape[0], known.shape[1] - n - c.U_p.shape[1]), G.dtype)],
+        [
+            c.U[:, :n],
+            c.U_p,
+            jnp.zeros((c.U.shape[0], known.shape[1] - n - c.U_p.shape[1]), G.dtype),
+        ],
         axis=1,
     )
     K = direct + c.U[:, n:] @ S

@@ -122,7 +122,7 @@ def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any
     ridge = 1e-8 * (jnp.trace(normal) / max(q, 1) + 1e-30)
     nu = -solve(normal + ridge * jnp.eye(q, dtype=dtype), a.T @ b)
     costate = lams[:, :, 0] + lams[:, :, 1:] @ nu
-    starts = jnp.concatenate([xs, costate], axis=1)[: total : steps]
+    starts = jnp.concatenate([xs, costate], axis=1)[:total:steps]
     none = jnp.zeros((0,), dtype)
     return Unknowns(
         starts,
@@ -173,7 +173,14 @@ def damped_newton(
         return v, dv, step, best, jnp.where(better, trial_cost, cost), k + 1
 
     one = jnp.ones((), flat.dtype)
-    start = (flat, jnp.zeros_like(flat), one, jnp.inf * one, jnp.inf * one, jnp.zeros((), jnp.int32))
+    start = (
+        flat,
+        jnp.zeros_like(flat),
+        one,
+        jnp.inf * one,
+        jnp.inf * one,
+        jnp.zeros((), jnp.int32),
+    )
     going = lambda c: (c[3] > 1e-9) & (c[2] > 1e-3) & (c[5] < iterations)
     v, _, _, norm, cost, _ = jax.lax.while_loop(going, body, start)
     return unravel(v), norm, cost

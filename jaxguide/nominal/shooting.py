@@ -103,7 +103,9 @@ class Shooting(eqx.Module):
         elif isinstance(guess, Unknowns):
             z = guess
         else:
-            z = jax.lax.stop_gradient(self._from_guess(jax.lax.stop_gradient(problem), guess, dtype))
+            z = jax.lax.stop_gradient(
+                self._from_guess(jax.lax.stop_gradient(problem), guess, dtype)
+            )
         frozen = jax.lax.stop_gradient(problem)
         z, fractions = jax.lax.stop_gradient(self._adaptive(frozen, z))
         return self._on_mesh(problem, z, fractions, certifier)
@@ -184,9 +186,7 @@ class Shooting(eqx.Module):
                 y,
                 args=problem,
                 saveat=diffrax.SaveAt(steps=True),
-                stepsize_controller=diffrax.PIDController(
-                    rtol=self.tolerance, atol=self.tolerance
-                ),
+                stepsize_controller=diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance),
                 max_steps=self.max_steps,
                 adjoint=diffrax.ForwardMode(),
                 throw=False,
@@ -229,9 +229,7 @@ class Shooting(eqx.Module):
             jnp.where(ok, breaks, uniform),
         )
 
-    def _on_mesh(
-        self, problem: Problem, z: Unknowns, breaks: Array, certifier: Any
-    ) -> Extremal:
+    def _on_mesh(self, problem: Problem, z: Unknowns, breaks: Array, certifier: Any) -> Extremal:
         p = self.degree + 1
         tau = jnp.asarray(nodes_lgl(p)[0], z.starts.dtype)
         inner = breaks[:-1, None] + jnp.diff(breaks)[:, None] * (tau[None, :-1] + 1) / 2
@@ -328,7 +326,9 @@ def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"
     columns = []
     for j in range(problem.m):
         shift = jnp.zeros_like(u).at[:, j].set(turn)
-        rates = jax.vmap(lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u)))
+        rates = jax.vmap(
+            lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
+        )
         here, there = rates(t, x, u), rates(t, x, u + shift)
         periodic = jnp.all(jnp.abs(here - there) <= 1e-9 * (1 + jnp.abs(here)))
         turns = jnp.round(jnp.diff(u[:, j]) / turn)
@@ -355,5 +355,3 @@ def _judge(problem: Problem, t: Array, x: Array, u: Array, costate: Array, worst
     result = RESULTS.where(minimising, RESULTS.successful, RESULTS.not_minimising)
     result = RESULTS.where(legal, result, RESULTS.bounds_violated)
     return RESULTS.where(converged, result, RESULTS.not_converged)
-
-

@@ -60,9 +60,7 @@ SAMPLE_INTERVAL = 0.02  # TU, section 5
 CAP = 0.3  # rad, bound on |du| in dispersed flights
 
 
-def mission(
-    extremal: Extremal | None = None, cap: float = CAP, **options: Any
-) -> Mission:
+def mission(extremal: Extremal | None = None, cap: float = CAP, **options: Any) -> Mission:
     """The paper's closed loop: exact gains sampled every 0.02 TU, du held over the sample."""
     extremal = solve(EarthMars()) if extremal is None else extremal
     tf = float(extremal.final_time)

@@ -13,7 +13,7 @@ import functools as ft
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,8 +25,7 @@ from jaxguide.flight.integrators import Adaptive
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, simulate
 from jaxguide.laws.holds import History, Hold, HoldControl, HoldDeviation
-from jaxguide.laws.law import Command, Law, SampleGrid
-from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
+from jaxguide.laws.law import Command, Law
 from jaxguide.montecarlo.sweep import sweep
 from jaxguide.neighboring.collocated import assemble
 from jaxguide.neighboring.gains import GainSchedule, gain_schedule
@@ -420,34 +419,41 @@ def _gain_errors(report: Report, errors: dict[str, dict[float, dict[int, float]]
 # The six cases of Table 1 ----------------------------------------------------------------------
 
 
+class Table(NamedTuple):
+    """A neighbouring-optimal law at points of every sample; leaves have a leading sample axis."""
+
+    x: Float[Array, "*k n"]  # nominal, at the sample
+    u: Float[Array, "*k stage m"]  # nominal
+    maps: Float[Array, "*k stage m n"]  # du per deviation at the sample, eq. (49)
+
+
 class Tabulated(Law):
-    """`NeighboringOptimal`, looked up: its nominal and histories at points of every sample.
+    """`NeighboringOptimal`, looked up in a Table.
 
     All variants then share one small program, which adaptive flights interpolate. The control's
     nearest singularity is some 0.05 TU from the real axis, so that twelve Legendre points on a
     sample of 0.02 TU leave 1e-12.
     """
 
-    table: PreparedNeighboring  # leaves have a leading sample axis
+    table: Table
     nodes: Float[Array, " stage"]
-    start_time: Float[Array, ""]
     interval: Float[Array, ""]
 
     def start(self, x0: Array) -> None:
         return None
 
     def __call__(self, t_k: Any, x: Array, memory: None) -> tuple["TabulatedCommand", None]:
-        k = jnp.round((t_k - self.start_time) / self.interval).astype(int)
+        k = jnp.round(t_k / self.interval).astype(int)
         one = jax.tree_util.tree_map(lambda a: a[k], self.table)
-        result = RESULTS.where(one.inside, RESULTS.successful, RESULTS.outside_horizon)
-        return TabulatedCommand(self, one, t_k, x - one.x_nominal, result, jnp.array(False)), None
+        command = TabulatedCommand(self, one, t_k, x - one.x, RESULTS.successful, jnp.array(False))
+        return command, None
 
 
 class TabulatedCommand(Command):
     """What `Tabulated` orders from `t_k` on."""
 
     law: Tabulated
-    one: PreparedNeighboring
+    one: Table
     t_k: Float[Array, ""]
     dx: Float[Array, " n"]
     result: RESULTS
@@ -457,7 +463,7 @@ class TabulatedCommand(Command):
         return interpolate(self.law.nodes, table, 2 * (t - self.t_k) / self.law.interval - 1)
 
     def nominal(self, t: Any) -> Float[Array, " m"]:
-        return self._at(self.one.u_nominal, t)
+        return self._at(self.one.u, t)
 
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self._at(self.one.maps, t) @ self.dx
@@ -501,11 +507,9 @@ def fly_cases(extremal: Extremal, exact: GainSchedule, paper: GainSchedule) -> d
     """Variant -> the six flights of Table 1, batched."""
     times = exact.times
     nodes = jnp.asarray(nodes_lgl(TABLE_NODES)[0])
-    width = jnp.diff(jnp.append(times, extremal.t[-1]))
-    grid = SampleGrid(times, times[:, None] + width[:, None] * (nodes[None, :] + 1) / 2)
-    of_paper, of_exact = _prepared(paper, grid), _prepared(exact, grid)
-    wrong = _wrong_sign_maps(extremal, grid)
-    of_wrong = eqx.tree_at(lambda p: (p.K, p.maps), of_paper, (wrong[:, 0], wrong))
+    stages = times[:, None] + SAMPLE_INTERVAL * (nodes[None, :] + 1) / 2
+    of_paper, of_exact = _tabulate(paper, stages), _tabulate(exact, stages)
+    of_wrong = of_paper._replace(maps=_wrong_sign_maps(extremal, times, stages))
     variants = {
         "lstsq64_interp": (of_paper, 0),
         "lstsq64_zoh_du": (of_paper, 1),
@@ -513,38 +517,37 @@ def fly_cases(extremal: Extremal, exact: GainSchedule, paper: GainSchedule) -> d
         "exact_interp": (of_exact, 0),
         "wrong sign": (of_wrong, 0),
     }
-    prepared = jax.tree_util.tree_map(lambda *a: jnp.stack(a), *(p for p, _ in variants.values()))
+    tables = Table(*(jnp.stack(a) for a in zip(*(t for t, _ in variants.values()), strict=True)))
     holds = jnp.asarray([hold for _, hold in variants.values()])
-    one = jax.tree_util.tree_map(lambda a: a[0], prepared)
-    law = Tabulated(one, nodes, times[0], jnp.asarray(SAMPLE_INTERVAL))
     mission = Mission(
         extremal.problem,
-        law,
+        Tabulated(of_exact, nodes, jnp.asarray(SAMPLE_INTERVAL)),
         extremal.x[0],
         SAMPLE_INTERVAL,
         hold=Numbered(holds[0]),
         integrator=Adaptive(1e-11),
     )
-    flights = jax.device_get(_fly(mission, prepared, holds, jnp.asarray(CASES)))
+    flights = jax.device_get(_fly(mission, tables, holds, jnp.asarray(CASES)))
     pick = lambda k: jax.tree_util.tree_map(lambda a: a[k], flights)
     return {name: pick(k) for k, name in enumerate(variants)}
 
 
 @eqx.filter_jit
-def _prepared(schedule: GainSchedule, grid: SampleGrid) -> PreparedNeighboring:
-    return NeighboringOptimal(schedule).prepared(grid)
+def _tabulate(schedule: GainSchedule, stages: Float[Array, "sample stage"]) -> Table:
+    over = lambda f: jax.vmap(jax.vmap(f, in_axes=(None, 0)))
+    maps = over(schedule.history)(schedule.times, stages)
+    u = over(lambda _, t: schedule.extremal(t).u)(schedule.times, stages)
+    return Table(schedule.extremal(schedule.times).x, u, maps)
 
 
 @eqx.filter_jit
-def _fly(
-    mission: Mission, prepared: PreparedNeighboring, holds: Array, deviations: Array
-) -> Flight:
-    def one(prepared: PreparedNeighboring, hold: Array, dx: Array) -> Flight:
+def _fly(mission: Mission, tables: Table, holds: Array, deviations: Array) -> Flight:
+    def one(table: Table, hold: Array, dx: Array) -> Flight:
         where = lambda m: (m.law.table, m.hold.number, m.initial_state)
-        return simulate(eqx.tree_at(where, mission, (prepared, hold, mission.initial_state + dx)))
+        return simulate(eqx.tree_at(where, mission, (table, hold, mission.initial_state + dx)))
 
     cases = jax.vmap(one, in_axes=(None, None, 0))
-    return jax.vmap(cases, in_axes=(0, 0, None))(prepared, holds, deviations)
+    return jax.vmap(cases, in_axes=(0, 0, None))(tables, holds, deviations)
 
 
 def final_errors(flight: Flight, reoptimised: list[Extremal]) -> np.ndarray:
@@ -563,9 +566,7 @@ VARIANTS = {
 }
 
 
-def _table_2(
-    report: Report, flights: dict[str, Flight], reoptimised: list[Extremal]
-) -> None:
+def _table_2(report: Report, flights: dict[str, Flight], reoptimised: list[Extremal]) -> None:
     section = report.section(
         "Re-optimised",
         "Each case solved again from its perturbed start, without a guess.",
@@ -609,7 +610,9 @@ def _errors(
 
 
 @eqx.filter_jit
-def _wrong_sign_maps(extremal: Extremal, grid: SampleGrid) -> Float[Array, "sample stage m n"]:
+def _wrong_sign_maps(
+    extremal: Extremal, times: Float[Array, " sample"], stages: Float[Array, "sample stage"]
+) -> Float[Array, "sample stage m n"]:
     """Control histories of eq. (49) with -H_uu for H_uu in eqs (16)-(21), H_xx as it is."""
     problem, n, points = extremal.problem, extremal.problem.n, WRONG_SIGN_NODES
     nodes = jnp.asarray(nodes_lgl(points)[0])
@@ -633,7 +636,7 @@ def _wrong_sign_maps(extremal: Extremal, grid: SampleGrid) -> Float[Array, "samp
         du = U[:, :, :n] @ Z[0] + U[:, :, n:] @ Z[1]
         return jax.vmap(lambda t: interpolate(nodes, du, (t - t0) / half - 1))(stages)
 
-    return jax.lax.map(one, (grid.times, grid.stages))
+    return jax.lax.map(one, (times, stages))
 
 
 def _wrong_sign(report: Report, flight: Flight, reoptimised: list[Extremal]) -> None:
