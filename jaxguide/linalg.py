@@ -1,7 +1,7 @@
 """Small dense linear algebra without LAPACK: it vectorises, and cannot hang under `vmap`.
 
-On CPU a `vmap` over LAPACK calls runs them one by one and has deadlocked at batch 64; on GPU batched
-QR is a loop. The matrices of guidance are small (2n by 2n), so elimination by hand wins.
+On CPU a `vmap` over LAPACK calls runs them one by one and has deadlocked at batch 64; on GPU
+batched QR is a loop. The matrices of guidance are small (2n by 2n), so elimination by hand wins.
 """
 
 from typing import Any
