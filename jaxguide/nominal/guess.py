@@ -117,6 +117,16 @@ def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any
         return f_u.T @ lam + cost_u[:, None] * unit[None, :]
 
     rows = jax.vmap(h_u_rows)(times, xs, lams).reshape(-1, 1 + q)
+    if is_free(problem.final_time):
+        # H(tf) = -dEbar/dtf sets the scale that a pure minimum-time problem has from nowhere else;
+        # weighted like all the others together.
+        u_f = control(tf)
+        g_t = jax.grad(problem.endpoint_cost, argnums=3)(x0, xs[-1], t0, tf)
+        j_t = jax.jacfwd(problem.endpoint_constraints, argnums=3)(x0, xs[-1], t0, tf)
+        known = problem.running_cost(tf, xs[-1], u_f) + g_t
+        row = problem.dynamics(tf, xs[-1], u_f) @ terminal
+        row = row + jnp.concatenate([known[None], j_t])
+        rows = jnp.concatenate([rows, row[None] * jnp.sqrt(1.0 * rows.shape[0])])
     a, b = rows[:, 1:], rows[:, 0]
     normal = a.T @ a
     ridge = 1e-8 * (jnp.trace(normal) / max(q, 1) + 1e-30)

@@ -1,0 +1,502 @@
+"""Gains against independent numbers, closed forms, transition matrices and re-solved problems."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxguide as jg
+import numpy as np
+import pytest
+from conftest import SMALL, DoubleIntegrator, Regulator, ScalarLQR
+from jaxguide.neighboring import gains as gains_module
+from jaxguide.problems.earth_mars import EarthMars
+from jaxguide.reproduce.earth_mars import GAINS_EXACT, GAINS_LEAST_SQUARES, GAINS_SQUARE, relative
+from scipy.integrate import solve_ivp
+
+PAPER_TIMES = np.asarray(list(GAINS_EXACT))
+# End conditions of the reference file: eq. (15) with H maximised, so the costate's sign changes.
+PSI_X = np.array([[0, 1, 0], [0.26542793166756756, 0, 1], [0.3300437663973597, 0, 0]])
+PSI_LAMBDA = -np.array([[0, 0, 0], [0, 0, 0], [1, 0, -0.26542793166756756]])
+
+
+def flags(schedule):
+    """The reason of every time, as a list of names."""
+    names = ("successful", "gain_unresolved", "conjugate_point", "not_minimising")
+    codes = np.asarray(schedule.result._value)
+    code = {int(getattr(jg.RESULTS, name)._value): name for name in names}
+    return [code[int(c)] for c in codes]
+
+
+# Earth-Mars -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def at_paper_times(earth_mars):
+    return jg.gain_schedule(earth_mars, PAPER_TIMES, parameters=("thrust",))
+
+
+def test_segmented_against_exact_gains(at_paper_times):
+    for t, K in zip(PAPER_TIMES, at_paper_times.K[:, 0], strict=True):
+        # The required accuracy; the last 0.02 TU lose digits as 1/T^2.
+        assert relative(K, GAINS_EXACT[t]) <= (1e-8 if t <= 3.2 else 1e-6), t
+    assert bool(at_paper_times.resolved.all()) and not bool(at_paper_times.bound_active.any())
+    assert at_paper_times.error.shape == (9,) and float(at_paper_times.error[0]) < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("method", "wanted"), [("least_squares", GAINS_LEAST_SQUARES), ("square", GAINS_SQUARE)]
+)
+def test_the_papers_gains(earth_mars, method, wanted):
+    s = jg.gain_schedule(earth_mars, PAPER_TIMES, method, nodes=65)
+    for t, K in zip(PAPER_TIMES, s.K[:, 0], strict=True):
+        if t <= 3.0:  # later both are at the mercy of their condition number
+            assert relative(K, wanted[t]) <= 1e-8, t
+            assert relative(s(t)[0], wanted[t]) <= 1e-8, t
+    # Wrong in the first digit before the turn (up to 0.5 relative), right from tau = 2 on: the
+    # schedule must know.
+    true = np.array([relative(K, GAINS_EXACT[t]) for t, K in zip(PAPER_TIMES, s.K[:, 0], strict=True)])
+    assert true[0] > 0.05 and not bool(s.resolved[0])
+    np.testing.assert_array_equal(s.resolved[PAPER_TIMES >= 2], True)
+    np.testing.assert_allclose(s.error[:4], true[:4], rtol=1e-4)
+    assert flags(s)[0] == "gain_unresolved"
+
+
+def test_history_equals_the_papers_beyond_the_turn(earth_mars, at_paper_times):
+    paper = jg.gain_schedule(earth_mars, PAPER_TIMES, "least_squares", nodes=65)
+    for t in (2.0, 2.013, 2.5, 3.1, 3.319):
+        got, want = at_paper_times.history(2.0, t), paper.history(2.0, t)
+        # Both are good to 1e-9 from tau = 2 (table of the reference file: 3e-12 in K itself).
+        assert relative(got[0], want[0]) <= 1e-8, t
+
+
+def test_end_conditions_span_the_reference_rows(earth_mars):
+    linear = jg.linearize(earth_mars, np.array([0.0]))
+    rows = np.hstack([linear.psi_x, linear.psi_lambda])
+    singular = np.linalg.svd(np.vstack([rows, np.hstack([PSI_X, PSI_LAMBDA])]), compute_uv=False)
+    assert singular[2] > 0.1 and singular[3] < 1e-10  # rank 3: the same row space
+
+
+def test_linearize_against_matrices_by_hand(earth_mars):
+    times = np.array([0.0, 1.3, 1.69, 3.0])
+    linear = jg.linearize(earth_mars, times)
+    for i, t in enumerate(times):
+        (r, vr, vt), (eps,), lam = earth_mars(t)
+        a = 0.1405 / (1 - 0.0749 * t)
+        f_x = np.array(
+            [
+                [0, 1, 0],
+                [-(vt**2) / r**2 + 2 / r**3, 0, 2 * vt / r],
+                [vr * vt / r**2, -vt / r, -vr / r],
+            ]
+        )
+        f_u = a * np.array([[0], [np.cos(eps)], [-np.sin(eps)]])
+        second = lam[1] * (2 * vt**2 / r**3 - 6 / r**4) - lam[2] * 2 * vr * vt / r**3
+        H_xx = np.array(
+            [
+                [second, lam[2] * vt / r**2, -2 * lam[1] * vt / r**2 + lam[2] * vr / r**2],
+                [lam[2] * vt / r**2, 0, -lam[2] / r],
+                [-2 * lam[1] * vt / r**2 + lam[2] * vr / r**2, -lam[2] / r, 2 * lam[1] / r],
+            ]
+        )
+        H_uu = -a * (lam[1] * np.sin(eps) + lam[2] * np.cos(eps))
+        # H_xu = 0: thrust acceleration does not depend on the state. Rounding of O(1) numbers.
+        close = lambda got, want: np.testing.assert_allclose(got, want, rtol=0, atol=1e-13)
+        close(linear.f_x[i], f_x)
+        close(linear.f_u[i], f_u)
+        close(linear.H_xx[i], H_xx)
+        close(linear.H_xu[i], np.zeros((3, 1)))
+        close(linear.H_uu[i], [[H_uu]])
+        close(linear.A[i], f_x)  # eq. (19) with H_xu = 0
+        np.testing.assert_allclose(linear.B[i], -f_u @ f_u.T / H_uu, rtol=1e-10, atol=1e-13)
+        close(linear.Q[i], H_xx)
+        np.testing.assert_allclose(linear.U[i, :, 3:], -f_u.T / H_uu, rtol=1e-10, atol=1e-13)
+        assert H_uu > 0
+
+
+def test_linearize_refuses_a_lone_time(earth_mars):
+    with pytest.raises(ValueError, match=r"shape \(\); give a vector"):
+        jg.linearize(earth_mars, 0.5)
+
+
+def re_solve(**changes):
+    return jg.solve(dataclasses.replace(EarthMars(), **changes), jg.Shooting(starts=8))
+
+
+def test_history_against_re_solved_extremals(earth_mars, at_paper_times):
+    """Central differences of re-solved flights over the whole horizon, its end included."""
+    h = 1e-5
+    t = jnp.array([0.0, 0.7, 1.6, 1.7, 2.4, 3.0, 3.32])
+    for i in range(3):
+        up, down = (
+            re_solve(initial_state=tuple(np.array([1.0, 0.0, 1.0]) + s * h * np.eye(3)[i]))
+            for s in (1, -1)
+        )
+        slope = (up(t).u - down(t).u)[:, 0]
+        slope = (slope - 2 * np.pi * np.round(slope / (2 * np.pi))) / (2 * h)
+        got = np.array([at_paper_times.history(0.0, s)[0, i] for s in t])
+        # h^2 K'''/6: the turn amplifies (du rises to 40 there), so 1e-4 of the largest.
+        np.testing.assert_allclose(got, slope, rtol=0, atol=1e-4 * np.abs(slope).max())
+        np.testing.assert_allclose(got[0], slope[0], rtol=1e-5)
+
+
+def test_gains_for_thrust_and_target_against_re_solved(at_paper_times):
+    h = 1e-5
+    angle = lambda e: float(jnp.arctan2(-e.costate[0, 1], -e.costate[0, 2]))
+    slope = lambda a, b: (angle(a) - angle(b)) / (2 * h)
+    thrust = slope(re_solve(thrust=0.1405 + h), re_solve(thrust=0.1405 - h))
+    # Error of the difference: h^2 times some 1e2 / 6, and rounding 1e-12 / h = 1e-7.
+    np.testing.assert_allclose(at_paper_times.K_parameters[0, 0, 0], thrust, rtol=1e-6)
+    # Both constraints moved together, which keeps the compiled program of the nominal.
+    target = slope(re_solve(endpoint_bounds=(h, h)), re_solve(endpoint_bounds=(-h, -h)))
+    np.testing.assert_allclose(at_paper_times.K_target[0, 0].sum(), target, rtol=1e-6)
+
+
+def test_between_times_the_schedule_is_as_good_as_at_them(schedule, at_paper_times):
+    for t in (0.111, 1.687, 2.5, 3.2001):
+        # Same sweep, evaluated elsewhere; both within their errors of the truth.
+        fine = float(jnp.interp(t, schedule.times, schedule.error))
+        assert relative(at_paper_times(t)[0], schedule(t)[0]) <= 1e-8 + fine
+    for i in (0, 5, 165):
+        assert relative(schedule(schedule.times[i])[0], schedule.K[i, 0]) <= 1e-9
+    np.testing.assert_array_equal(schedule(-1.0), schedule(0.0))  # held outside
+
+
+@pytest.fixture(scope="module")
+def truth(earth_mars):
+    times = np.append(np.linspace(0.0, 3.2, 40), [3.25, 3.3])
+    return times, jg.gain_schedule(earth_mars, times, segments=192, nodes=12, sweeps=16).K
+
+
+@pytest.mark.parametrize(("segments", "nodes"), [(16, 4), (32, 6), (64, 4)])
+def test_the_error_estimate_is_honest(earth_mars, truth, segments, nodes):
+    times, K = truth
+    s = jg.gain_schedule(earth_mars, times, segments=segments, nodes=nodes)
+    size = np.abs(K).max(axis=(1, 2))
+    true = np.abs(s.K - K).max(axis=(1, 2)) / size
+    estimate = np.asarray(s.error)
+    assert true.max() > 1e-10  # else this test shows nothing
+    assert np.all((estimate >= true) | (true <= 1e-10)), (estimate / true).min()
+    assert estimate.max() <= 30 * true.max()
+
+
+# Closed forms ---------------------------------------------------------------------------------
+
+
+DI_LEFT = np.array([1.0, 0.75, 0.5, 0.1, 1e-2, 1e-3])
+
+
+@pytest.fixture(scope="module")
+def di_schedule(double_integrator):
+    return jg.gain_schedule(double_integrator, 1 - DI_LEFT, parameters=("k",))
+
+
+def test_double_integrator_to_the_last_millisecond(di_schedule):
+    T = 1 - np.asarray(di_schedule.times)  # of the times as rounded
+    want = np.stack([-6 / T**2, -4 / T], axis=1)
+    error = np.abs(di_schedule.K[:, 0] - want).max(axis=1) / np.abs(want).max(axis=1)
+    assert np.all(error[T >= 0.1] <= 1e-9)
+    assert error[4] <= 1e-6 and error[5] <= 1e-4
+    # Below the size of the last segment the estimate must still cover what is lost.
+    assert np.all((np.asarray(di_schedule.error) >= error) | (error <= 1e-10))
+
+
+def test_double_integrator_parameters_and_target(di_schedule):
+    T = DI_LEFT[:4]
+    e = di_schedule.extremal
+    x = np.asarray(e(jnp.asarray(1 - T)).x)
+    # k u = 6 (d - x)/T^2 - (4 v + 2 w)/T to reach (d, w).
+    u = 6 * (1 - x[:, 0]) / T**2 - 4 * x[:, 1] / T
+    np.testing.assert_allclose(di_schedule.K_parameters[:4, 0, 0], -u, rtol=1e-8, atol=1e-8)
+    want = np.stack([6 / T**2, -2 / T], axis=1)
+    np.testing.assert_allclose(di_schedule.K_target[:4, 0], want, rtol=1e-8)
+    np.testing.assert_array_equal(di_schedule.dtf_dx, np.zeros((6, 2)))  # tf is fixed
+
+
+def test_double_integrator_history_to_the_end(di_schedule):
+    for start in (0.0, 0.25, 0.9):
+        for t in (start, 0.95, 1.0):
+            T, s = 1 - start, t - start
+            want = [-6 / T**2 + 12 * s / T**3, -4 / T + 6 * s / T**2]
+            got = di_schedule.history(start, t)[0]
+            np.testing.assert_allclose(got, want, rtol=1e-8, atol=1e-8 * 6 / T**2)
+
+
+@pytest.mark.parametrize("method", ["least_squares", "square"])
+def test_double_integrator_collocated(double_integrator, method):
+    # The solution is a cubic: 9 points hold it exactly.
+    s = jg.gain_schedule(double_integrator, 1 - DI_LEFT, method, nodes=9)
+    T = 1 - np.asarray(s.times)
+    want = np.stack([-6 / T**2, -4 / T], axis=1)
+    error = np.abs(s.K[:, 0] - want).max(axis=1) / np.abs(want).max(axis=1)
+    assert np.all(error[:4] <= 1e-10) and error[4] <= 1e-6 and error[5] <= 1e-4
+    np.testing.assert_allclose(s.history(0.25, 1.0)[0], [6 / 0.75**2, 2 / 0.75], rtol=1e-8)
+    np.testing.assert_allclose(s(0.6)[0], [-6 / 0.4**2, -4 / 0.4], rtol=1e-8)
+
+
+def riccati(p, T):
+    """S of S' = -2 a S + S^2 - q, S = s at the end, T before it."""
+    w = np.sqrt(p.a**2 + p.q)
+    c = (p.s - p.a - w) / (p.s - p.a + w) * np.exp(-2 * w * T)
+    return p.a + w * (1 + c) / (1 - c)
+
+
+def test_scalar_lqr(scalar_lqr):
+    times = np.array([0.0, 0.4, 1.0, 1.4, 1.49, 1.4999])
+    s = jg.gain_schedule(scalar_lqr, times)
+    # No constraint at the end, so nothing is lost there.
+    np.testing.assert_allclose(s.K[:, 0, 0], -riccati(ScalarLQR(), 1.5 - times), rtol=1e-10)
+    assert s.K_target.shape == (6, 1, 0) and bool(s.resolved.all())
+
+
+REGULATOR_PARTS = np.array([0.0, 0.1, 0.2, 0.22, 0.3, 0.75, 0.98])  # of the horizon
+
+
+def regulated(regulator, times=None, **changes):
+    problem = dataclasses.replace(Regulator(), **changes)
+    e = jg.solve(problem, SMALL, throw=False)
+    return jg.gain_schedule(e, REGULATOR_PARTS * problem.final_time)
+
+
+def test_two_controls_against_closed_forms(regulator):
+    a, q = np.array([0.5, -0.3]), np.array([2.0, 0.5])
+    s = regulated(regulator, a=tuple(a), q=tuple(q))
+    w, T = np.sqrt(a**2 + q), (1 - REGULATOR_PARTS)[:, None]
+    want = -(a + w / np.tanh(w * T))
+    np.testing.assert_allclose(np.diagonal(s.K, axis1=1, axis2=2), want, rtol=1e-8)
+    off = np.stack([s.K[:, 0, 1], s.K[:, 1, 0]])
+    np.testing.assert_allclose(off, 0, atol=1e-8)
+    assert bool(s.resolved.all())
+
+
+def test_a_long_unstable_horizon_keeps_its_gain(regulator):
+    # e^40 = 2e17: without normalising, the rows are lost altogether.
+    s = regulated(
+        regulator, a=(1.0, 1.0), q=(0.0, 1.0), final_time=40.0, initial_state=(0.0, 0.0)
+    )
+    a, w, T = 1.0, np.sqrt([1.0, 2.0]), 40 * (1 - REGULATOR_PARTS)[:, None]
+    want = -(a + w / np.tanh(w * T))
+    got = np.diagonal(s.K, axis1=1, axis2=2)
+    # 64 segments for 40 time constants resolve to the schedule's own default tolerance at least.
+    np.testing.assert_allclose(got, want, rtol=1e-6)
+    assert bool(s.resolved.all())
+
+
+@pytest.mark.parametrize(
+    "q", [(-1.0, -0.25), (-1.0, -1.0), (-1.0, -1.0001)], ids=["simple", "double", "close pair"]
+)
+def test_conjugate_points_are_flagged(regulator, q):
+    # x' = u, J = int (u^2 - w^2 x^2)/2, ends given: conjugate pi/w before the end.
+    s = regulated(regulator, q=q, final_time=4.0)
+    T = 4 * (1 - REGULATOR_PARTS)
+    w = np.sqrt(-np.array(q))
+    ahead = np.any(w * T[:, None] > np.pi, axis=1)
+    assert ahead.tolist() == [True, True, True, False, False, False, False]
+    assert flags(s) == ["conjugate_point" if c else "successful" for c in ahead]
+    np.testing.assert_array_equal(s.resolved, ~ahead)
+    want = -w / np.tan(w * T[~ahead][:, None])
+    np.testing.assert_allclose(np.diagonal(s.K[3:], axis1=1, axis2=2), want, rtol=1e-6)
+
+
+@pytest.mark.parametrize("r", [(1.0, -1.0), (1.0, 0.0)], ids=["negative", "singular"])
+def test_a_control_cost_that_does_not_minimise_is_flagged(regulator, r):
+    spoiled = eqx.tree_at(lambda e: e.problem.r, regulator, tuple(jnp.asarray(v) for v in r))
+    s = jg.gain_schedule(spoiled, REGULATOR_PARTS)
+    assert not bool(s.resolved.any()) and set(flags(s)) == {"not_minimising"}
+
+
+def test_active_bounds_are_flagged(double_integrator):
+    at_bound = eqx.tree_at(
+        lambda e: e.problem.control_bounds, double_integrator, (jnp.asarray(-6.0), jnp.asarray(6.0))
+    )
+    s = jg.gain_schedule(at_bound, 1 - DI_LEFT)
+    np.testing.assert_array_equal(s.bound_active, [True, False, False, False, False, False])
+
+
+def test_free_final_time_against_a_closed_form(free_time):
+    # From (x, v) with T left: u = 6 d/T^2 - 4 v/T, d = 1 - x, where T minimises
+    # T + 6 d^2/T^3 - 6 d v/T^2 + 2 v^2/T: c(d, v, T) = 0 below.
+    tf = 18**0.25
+    times = tf - np.array([1.0, 0.75, 0.5, 0.1, 1e-2, 1e-3]) * tf
+    s = jg.gain_schedule(free_time, times)
+    x, v = np.asarray(free_time(jnp.asarray(times)).x).T
+    T, d = tf - times, 1 - x
+    c_d = -36 * d / T**4 + 12 * v / T**3
+    c_v = 12 * d / T**3 - 4 * v / T**2
+    c_T = 72 * d**2 / T**5 - 36 * d * v / T**4 + 4 * v**2 / T**3
+    T_x, T_v = c_d / c_T, -c_v / c_T  # d falls as x rises
+    u_T = -12 * d / T**3 + 4 * v / T**2
+    want = np.stack([-6 / T**2 + u_T * T_x, -4 / T + u_T * T_v], axis=1)
+    error = np.abs(s.K[:, 0] - want).max(axis=1) / np.abs(want).max(axis=1)
+    # d itself is a small difference near the end: the formula loses (T/tf)^-2 eps of its own.
+    assert np.all(error <= [1e-9, 1e-9, 1e-9, 1e-8, 1e-6, 1e-4]), error
+    np.testing.assert_allclose(s.dtf_dx[:3], np.stack([T_x, T_v], axis=1)[:3], rtol=1e-8, atol=1e-9)
+
+
+def test_free_final_time_against_re_solved(free_time):
+    s = jg.gain_schedule(free_time, 18**0.25 * np.linspace(0, 0.9, 6))
+    h = 1e-4
+    for i in range(2):
+        up, down = (
+            jg.solve(dataclasses.replace(free_time.problem, initial_state=tuple(sign * h * np.eye(2)[i])), SMALL)
+            for sign in (1, -1)
+        )
+        # h^2 f'''/6 with derivatives of order 10 to 100: 1e-7.
+        np.testing.assert_allclose(s.K[0, 0, i], (up.u[0, 0] - down.u[0, 0]) / (2 * h), rtol=1e-6)
+        np.testing.assert_allclose(
+            s.dtf_dx[0, i], (up.final_time - down.final_time) / (2 * h), rtol=1e-6
+        )
+
+
+def test_zermelo_shortest_time_against_bryson_ho(zermelo):
+    """Position to go is a function of the present and final headings; its inverse Jacobian is K."""
+
+    def to_go(z):
+        a, b = z
+        sec = lambda v: 1 / jnp.cos(v)
+        logarithm = jnp.log((jnp.tan(b) + sec(b)) / (jnp.tan(a) + sec(a)))
+        x = 0.5 * (sec(b) * (jnp.tan(b) - jnp.tan(a)) - jnp.tan(a) * (sec(b) - sec(a)) + logarithm)
+        return jnp.stack([x, sec(a) - sec(b)])
+
+    times = float(zermelo.final_time) * np.array([0.0, 0.2, 0.5, 0.7, 0.9, 0.99])
+    s = jg.gain_schedule(zermelo, times)
+    end = zermelo.u[-1, 0]
+    for i, t in enumerate(times):
+        heading = zermelo(t).u[0]
+        z = jnp.stack([heading, end])
+        np.testing.assert_allclose(to_go(z), zermelo(t).x, rtol=0, atol=1e-9)
+        inverse = np.linalg.inv(jax.jacfwd(to_go)(z))
+        # The log and secants are singular at 90 and 270 degrees only; near the end 1/T is lost.
+        np.testing.assert_allclose(s.K[i, 0], inverse[0], rtol=1e-7, atol=1e-8)
+        slope = np.array([1 / np.cos(heading) ** 2, -1 / np.cos(end) ** 2])
+        np.testing.assert_allclose(s.dtf_dx[i], slope @ inverse, rtol=1e-7, atol=1e-8)
+
+
+class Crossing(jg.Problem):
+    """As far downstream as possible in fixed time, landing at y = 0.4: a user's ten lines."""
+
+    state_names = ("x", "y")
+    control_names = ("heading",)
+    initial_state = (0.0, 0.0)
+    final_time = 2.0
+
+    def dynamics(self, t, x, u):
+        current = jnp.stack([0.6 * x[1] ** 2, 0.5 * jnp.sin(x[0])])
+        return current + jnp.stack([jnp.cos(u[0]), jnp.sin(u[0])])
+
+    def endpoint_cost(self, x0, xf, t0, tf):
+        return -xf[0]
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return xf[1:] - 0.4
+
+
+def test_zermelo_fixed_time_against_its_transition_matrix():
+    e = jg.solve(Crossing(), jg.Shooting(arcs=2, segments=16, starts=16))
+    times = np.array([0.0, 0.5, 1.0, 1.5, 1.9])
+    s = jg.gain_schedule(e, times)
+
+    def rates(t, z):
+        """Canonical equations of (x, y, l, k) and their variation, by hand, DOP853."""
+        x, y, l, k = z[:4]
+        size = np.hypot(l, k)  # cos = -l/size, sin = -k/size minimise H
+        f = [0.6 * y**2 - l / size, 0.5 * np.sin(x) - k / size, -0.5 * k * np.cos(x), -1.2 * l * y]
+        B = np.array([[-k * k, k * l], [k * l, -l * l]]) / size**3
+        J = np.zeros((4, 4))
+        J[0, 1], J[1, 0] = 1.2 * y, 0.5 * np.cos(x)
+        J[:2, 2:] = B
+        J[2, 0], J[2, 3] = 0.5 * k * np.sin(x), -0.5 * np.cos(x)
+        J[3, 1], J[3, 2] = -1.2 * l, -1.2 * y
+        return np.concatenate([f, (J @ z[4:].reshape(4, 4)).ravel()])
+
+    for i, t in enumerate(times):
+        point = e(t)
+        z = np.concatenate([point.x, point.costate, np.eye(4).ravel()])
+        end = solve_ivp(rates, (t, 2.0), z, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        np.testing.assert_allclose(end[[1, 2]], [0.4, -1.0], rtol=0, atol=1e-10)  # landing, l = -1
+        phi = end[4:].reshape(4, 4)[[1, 2]]  # y and the costate of x are given at the end
+        S = -np.linalg.solve(phi[:, 2:], phi[:, :2])
+        l, k = point.costate
+        K = np.array([-k, l]) / (l * l + k * k) @ S  # heading = arctan2(-k, -l)
+        np.testing.assert_allclose(s.K[i, 0], K, rtol=1e-9, atol=1e-9)
+
+
+# Refusals, transformations --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        ([0.5, 0.2], r"ascend: times\[0\] = 0.5, times\[1\] = 0.2"),
+        ([0.2, 0.2], "ascend"),
+        ([-0.1, 0.5], r"span \[-0.1, 0.5\], outside"),
+        ([0.5, 1.0], "stop short of it"),
+        ([0.0, np.nan], "nan; give finite"),
+        ([], r"shape \(0,\)"),
+        (0.5, r"shape \(\); give a vector"),
+    ],
+)
+def test_refuses_times(double_integrator, times, words):
+    with pytest.raises(ValueError, match=words):
+        jg.gain_schedule(double_integrator, times)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"method": "riccati"}, "'riccati'; choose one of segmented, least_squares, square"),
+        ({"segments": 12}, "segments is 12; give a positive multiple of 8"),
+        ({"segments": 0}, "segments is 0"),
+        ({"nodes": 2}, "nodes is 2; give at least 3"),
+        ({"sweeps": 0}, "sweeps is 0"),
+        ({"parameters": ("mass",)}, "'mass' is not a scalar parameter of DoubleIntegrator"),
+        ({"parameters": ("target",)}, "'target' is not a scalar parameter"),
+    ],
+)
+def test_refuses_options(double_integrator, options, words):
+    with pytest.raises(ValueError, match=words):
+        jg.gain_schedule(double_integrator, [0.0, 0.5], **options)
+
+
+def test_a_schedule_passes_through_jit(di_schedule, at_paper_times):
+    leaves = jax.tree_util.tree_leaves(at_paper_times)
+    assert all(eqx.is_array(leaf) for leaf in leaves)
+    got = jax.jit(lambda s, t: (s, s(t)))(di_schedule, jnp.asarray(0.5))
+    np.testing.assert_allclose(got[1][0], [-24.0, -8.0], rtol=1e-8)
+    np.testing.assert_array_equal(got[0].K, di_schedule.K)
+
+
+def test_gains_differentiate_through_the_solve():
+    method = jg.Shooting(arcs=1, segments=4, starts=1)
+
+    def gain(k):
+        e = jg.solve(dataclasses.replace(DoubleIntegrator(), k=k), method)
+        return jg.gain_schedule(e, jnp.array([0.0, 0.5]), segments=8).K[1, 0]
+
+    k = jnp.asarray(2.0)
+    # K = (-24, -8)/k at T = 1/2
+    slope = jax.jit(jax.jacrev(gain))(k)
+    np.testing.assert_allclose(slope, [24 / 4, 8 / 4], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_earth_mars_gain_differentiates_with_respect_to_thrust(earth_mars):
+    def gain(thrust):
+        e = jg.solve(EarthMars(thrust=thrust), jg.Shooting(), earth_mars, throw=False)
+        return jg.gain_schedule(e, jnp.array([0.0, 1.0, 2.5])).K[:, 0]
+
+    h = 1e-4
+    k = jnp.asarray(0.1405)
+    slope = jax.jit(jax.jacfwd(gain))(k)
+    up, down = jax.jit(gain)(k + h), jax.jit(gain)(k - h)
+    # h^2 f'''/6: the turn's place moves with thrust, so derivatives grow tenfold an order.
+    want = (up - down) / (2 * h)
+    np.testing.assert_allclose(slope, want, rtol=0, atol=1e-4 * np.abs(want).max())
+
+
+def test_the_compiled_sweep_traces_once(scalar_lqr, monkeypatch):
+    inner = eqx.debug.assert_max_traces(gains_module._segmented.__wrapped__, max_traces=1)
+    monkeypatch.setattr(gains_module, "_segmented", eqx.filter_jit(inner))
+    for end in (1.0, 1.2, 1.4):
+        s = jg.gain_schedule(scalar_lqr, np.linspace(0.0, end, 3), segments=8)
+        np.testing.assert_allclose(s.K[0, 0, 0], -riccati(ScalarLQR(), 1.5), rtol=1e-6)

@@ -1,0 +1,470 @@
+"""Extremals: against independent numbers and closed forms; their certificates; their derivatives."""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxguide as jg
+import numpy as np
+import pytest
+from conftest import SMALL, DoubleIntegrator, FreeTime, Regulator, ScalarLQR
+from jaxguide import solving
+from jaxguide.problems.earth_mars import EarthMars
+from jaxguide.reproduce.earth_mars import ANGLES, COSTATE_END, COSTATE_START, RADIUS
+from scipy import optimize
+
+# Earth-Mars at two times that are no nodes, with the sign of a minimised H; computed without this
+# package (see jaxguide/reproduce/earth_mars.py, whose numbers have the same source).
+BETWEEN = {
+    1.0: (
+        (1.07567529135545057, 0.18654754702150509, 1.03225292131381051),
+        (-1.08364905768737613, -0.62727544628586737, -0.33799623749325370),
+    ),
+    2.0: (
+        (1.35749406043151304, 0.27595235002353990, 0.80291180886766516),
+        (-0.95844516862819105, 0.29711637202221336, -0.00528172823740076),
+    ),
+}
+D_RADIUS_D_THRUST = 3.5434202430  # of r(tf), by finite differences of re-solved problems
+
+
+def failed(certificate):
+    return {row["check"]: row for row in certificate.rows() if not row["passed"]}
+
+
+# Earth-Mars -----------------------------------------------------------------------------------
+
+
+def test_earth_mars_against_independent_numbers(earth_mars):
+    e = earth_mars
+    # The reference is good to 1e-13; shooting to 1e-12 of the boundary conditions.
+    np.testing.assert_allclose(e.x[-1, 0], RADIUS, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(e.objective, -RADIUS, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(e.costate[0], COSTATE_START, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(e.costate[-1], COSTATE_END, rtol=0, atol=1e-10)
+    # nu = costates of (v_r, v_t) at the end, since the constraints are linear in them.
+    np.testing.assert_allclose(e.multipliers.endpoint, COSTATE_END[1:], rtol=0, atol=1e-10)
+    assert float(e.residual) <= 1e-12
+    assert bool(e.result == jg.RESULTS.successful) and float(e.final_time) == 3.32
+
+
+def test_earth_mars_control_angle_is_unwrapped(earth_mars):
+    t = jnp.asarray(list(ANGLES))
+    got = np.asarray(earth_mars(t).u)[:, 0]
+    got = got - 2 * np.pi * np.round((got[0] - ANGLES[0.0]) / (2 * np.pi))
+    np.testing.assert_allclose(got, list(ANGLES.values()), rtol=0, atol=1e-10)
+    dense = np.asarray(earth_mars(jnp.linspace(0, 3.32, 3321)).u)[:, 0]
+    # The fastest turn is 19.67 rad/TU (reference file): 0.02 rad over 1e-3 TU.
+    assert 0.0195 < np.abs(np.diff(dense)).max() < 0.0198
+
+
+@pytest.mark.parametrize("t", BETWEEN)
+def test_earth_mars_between_nodes(earth_mars, t):
+    assert np.abs(np.asarray(earth_mars.t) - t).min() > 1e-6
+    point = earth_mars(t)
+    np.testing.assert_allclose(point.x, BETWEEN[t][0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(point.costate, BETWEEN[t][1], rtol=0, atol=1e-10)
+
+
+def test_extremal_at_nodes_and_beyond(earth_mars):
+    e = earth_mars
+    at = e(e.t[jnp.array([0, 7, 100, -1])])
+    for got, nodal in ((at.x, e.x), (at.costate, e.costate)):
+        np.testing.assert_allclose(got, nodal[jnp.array([0, 7, 100, -1])], rtol=0, atol=1e-14)
+    for outside, end in ((-1.0, 0), (9.0, -1)):
+        np.testing.assert_allclose(e(outside).x, e.x[end], rtol=0, atol=1e-14)
+        # one Newton step on H_u = 0 may move the last digits
+        np.testing.assert_allclose(e(outside).u, e.u[end], rtol=0, atol=1e-12)
+
+
+# Certificates ---------------------------------------------------------------------------------
+
+
+def test_certificate_passes_and_prints(earth_mars):
+    certificate = earth_mars.certificate
+    assert bool(jnp.all(certificate.passed))
+    text = str(certificate)
+    assert "FAILS" not in text and len(text.splitlines()) == len(certificate.names)
+
+
+def _spoil(where, by):
+    return lambda e: eqx.tree_at(where, e, replace_fn=by)
+
+
+BREAK = 12 * 12  # a node shared by two segments of 12th degree
+SPOILED = {  # row: how to break it, what and where it must name
+    "costate equation": (lambda e: e.costate, lambda v: v.at[BREAK, 1].add(1e-6), "costate of v_r", BREAK),
+    "state equation": (lambda e: e.x, lambda v: v.at[BREAK, 2].add(1e-6), "v_t", BREAK),
+    "stationarity H_u": (lambda e: e.u, lambda v: v.at[BREAK + 5].add(1e-6), "epsilon", BREAK + 5),
+    "transversality, end": (
+        lambda e: e.multipliers.endpoint,
+        lambda v: v.at[0].add(1e-6),
+        "costate of v_r",
+        -1,
+    ),
+    "initial state": (lambda e: e.x, lambda v: v.at[0, 1].add(1e-6), "v_r", 0),
+    "endpoint constraints": (lambda e: e.x, lambda v: v.at[-1, 2].add(1e-6), "constraint 1", -1),
+    "Legendre-Clebsch": (lambda e: e.u, lambda v: v + jnp.pi, "-min eig H_uu", None),
+    "spectral tail, state": (lambda e: e.x, lambda v: v.at[BREAK + 5, 0].add(1e-6), "r", None),
+    "control bounds": (lambda e: e.problem.control_bounds, lambda v: 0.5 * jnp.sign(v), "epsilon", -1),
+}
+
+
+@pytest.mark.parametrize("row", SPOILED)
+def test_a_spoiled_extremal_fails_in_the_right_row(earth_mars, row):
+    where, change, label, node = SPOILED[row]
+    if row == "control bounds":
+        change = lambda bounds: tuple(jnp.sign(b) * 0.5 for b in bounds)
+    spoiled = eqx.tree_at(where, earth_mars, change(where(earth_mars)))
+    certificate = spoiled.certificate
+    bad = failed(certificate)
+    assert row in bad and bad[row]["where"] == label
+    if node is not None:
+        assert bad[row]["time"] == float(earth_mars.t[node])
+    line = next(v for v in str(certificate).splitlines() if row in v)
+    assert line.startswith("FAILS") and f"{label} at t = " in line
+
+
+def test_a_nan_fails_its_rows(earth_mars):
+    spoiled = eqx.tree_at(lambda e: e.x, earth_mars, earth_mars.x.at[BREAK, 0].set(jnp.nan))
+    assert "state equation" in failed(spoiled.certificate)
+
+
+def test_the_costly_row_flies_the_control(earth_mars):
+    whole = jg.certify(earth_mars, costly=True)
+    assert "propagated state" in whole.names and bool(jnp.all(whole.passed))
+    spoiled = eqx.tree_at(lambda e: e.u, earth_mars, earth_mars.u + 1e-4)
+    row = failed(jg.certify(spoiled, costly=True))["propagated state"]
+    assert row["where"] in EarthMars.state_names and row["value"] > 1e-6
+
+
+# Single shooting and guesses ------------------------------------------------------------------
+
+
+def test_single_shooting_from_rough_costates(earth_mars):
+    rough = jnp.round(earth_mars.costate[0], 1)
+    e = jg.solve(EarthMars(), jg.Shooting(arcs=1), guess=rough)
+    assert e.residual <= 1e-12
+    np.testing.assert_allclose(e.x[-1, 0], RADIUS, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(e.costate[0], COSTATE_START, rtol=0, atol=1e-10)
+
+
+def test_an_extremal_of_a_similar_problem_as_guess(double_integrator):
+    near = dataclasses.replace(DoubleIntegrator(), k=2.0, final_time=1.5)
+    e = jg.solve(near, jg.Shooting(arcs=1, segments=4), guess=double_integrator)
+    # J = 6 d^2 / (k^2 T^3)
+    np.testing.assert_allclose(e.objective, 6 / (4 * 1.5**3), rtol=1e-12)
+
+
+def test_refuses_a_guess_of_the_wrong_shape():
+    with pytest.raises(ValueError, match=r"guess has shape \(3,\); give an Extremal or the 2"):
+        jg.solve(DoubleIntegrator(), SMALL, guess=jnp.zeros(3))
+
+
+# Derivatives and batches ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def of_thrust(earth_mars):
+    """thrust -> (objective, costate(0)) of the re-solved Earth-Mars problem."""
+    method = jg.Shooting(arcs=4, segments=16)
+
+    def solve(thrust):
+        e = jg.solve(EarthMars(thrust=thrust), method, earth_mars, throw=False)
+        return e.objective, e.costate[0], e.residual
+
+    return solve
+
+
+@pytest.fixture(scope="module")
+def batch(of_thrust):
+    """100 thrusts within 2 per cent, the last four for finite differences."""
+    h = 1e-3
+    thrust = 0.1405 * (1 + 0.02 * np.random.default_rng(0).uniform(-1, 1, 96))
+    thrust = jnp.asarray(np.append(thrust, 0.1405 + h * np.array([-2, -1, 1, 2])))
+    return h, thrust, jax.jit(jax.vmap(of_thrust))(thrust)
+
+
+def test_thrust_derivatives_both_ways(of_thrust, batch):
+    k = jnp.asarray(0.1405)
+
+    @jax.jit
+    def both(k):
+        value, pull = jax.vjp(lambda k: of_thrust(k)[:2], k)
+        tangents = jax.jvp(lambda k: of_thrust(k)[:2], (k,), (jnp.ones_like(k),))[1]
+        basis = jnp.eye(4, dtype=k.dtype)
+        reverse = jax.vmap(lambda b: pull((b[0], b[1:]))[0])(basis)
+        return tangents, reverse
+
+    (d_objective, d_costate), reverse = both(k)
+    # The published figure has ten digits after the point.
+    np.testing.assert_allclose(d_objective, -D_RADIUS_D_THRUST, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(reverse[0], -D_RADIUS_D_THRUST, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(reverse[1:], d_costate, rtol=1e-9)
+    h, _, (objective, costate, _) = batch
+    # Central differences of fourth order: error h^4 f^(5)/30, some 1e-8 for derivatives that grow
+    # by 1/thrust = 7 an order; rounding 1e-12/h = 1e-9.
+    five_point = lambda f: (f[-4] - 8 * f[-3] + 8 * f[-2] - f[-1]) / (12 * h)
+    np.testing.assert_allclose(d_objective, five_point(objective), rtol=1e-7)
+    np.testing.assert_allclose(d_costate, five_point(costate), rtol=1e-7)
+
+
+def test_vmap_equals_a_loop(of_thrust, batch):
+    _, thrust, (objective, costate, residual) = batch
+    assert float(residual.max()) <= 1e-12  # all 100 converged
+    one = jax.jit(of_thrust)
+    for i in (0, 33, 95):
+        alone = one(thrust[i])
+        np.testing.assert_allclose(objective[i], alone[0], rtol=1e-12)
+        np.testing.assert_allclose(costate[i], alone[1], rtol=1e-11)  # conditioning of shooting
+
+
+@pytest.mark.slow
+def test_vmap_equals_a_loop_for_all(of_thrust, batch):
+    _, thrust, (objective, costate, _) = batch
+    one = jax.jit(of_thrust)
+    for i, k in enumerate(thrust):
+        alone = one(k)
+        np.testing.assert_allclose(objective[i], alone[0], rtol=1e-12)
+        np.testing.assert_allclose(costate[i], alone[1], rtol=1e-11)
+
+
+def test_traced_solves_do_not_throw_and_do_not_retrace():
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def solve(k, end):
+        p = dataclasses.replace(DoubleIntegrator(), k=k, target=(end, 0.0 * end))
+        e = jg.solve(p, jg.Shooting(arcs=1, segments=4, starts=1))  # throw=True, but traced
+        return e.objective, e.result
+
+    compiled = eqx.filter_jit(solve)
+    objective, result = compiled(jnp.asarray(2.0), jnp.asarray(1.0))
+    np.testing.assert_allclose(objective, 1.5, rtol=1e-12)  # 6 / k^2
+    assert bool(result == jg.RESULTS.successful)
+    _, result = compiled(jnp.asarray(2.0), jnp.asarray(jnp.nan))
+    assert bool(result == jg.RESULTS.not_converged)
+
+
+def test_new_parameters_compile_nothing(double_integrator, compilations):
+    before = compilations()
+    e = jg.solve(dataclasses.replace(DoubleIntegrator(), k=3.0, final_time=2.0), SMALL)
+    # J = 6 / (k^2 T^3)
+    np.testing.assert_allclose(e.objective, 6 / (9 * 8), rtol=1e-12)
+    assert compilations() == before
+
+
+# Closed forms ---------------------------------------------------------------------------------
+
+
+def test_double_integrator(double_integrator):
+    e = double_integrator
+    t = np.asarray(e.t)
+    np.testing.assert_allclose(e.objective, 6.0, rtol=1e-13)
+    np.testing.assert_allclose(e.u[:, 0], 6 - 12 * t, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(e.x[:, 0], 3 * t**2 - 2 * t**3, rtol=0, atol=1e-12)
+    # H = u^2/2 + lambda . f minimised: lambda_v = -u, lambda_x = -12.
+    np.testing.assert_allclose(e.costate[:, 1], 12 * t - 6, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(e.costate[:, 0], -12 + 0 * t, rtol=0, atol=1e-11)
+    # Ebar = nu . e with e = xf - target: nu = lambda(tf).
+    np.testing.assert_allclose(e.multipliers.endpoint, [-12, 6], rtol=0, atol=1e-11)
+
+
+def test_scales_of_metres_and_seconds(double_integrator):
+    """10,000 km in 1,000 s: J = 6 d^2/T^3, and every row still passes."""
+    p = dataclasses.replace(DoubleIntegrator(), target=(1e7, 0.0), final_time=1e3)
+    e = jg.solve(p, SMALL)
+    np.testing.assert_allclose(e.objective, 6e14 / 1e9, rtol=1e-11)
+    assert not failed(e.certificate)
+
+
+def test_free_final_time(free_time):
+    tf = 18**0.25
+    np.testing.assert_allclose(free_time.final_time, tf, rtol=1e-12)
+    np.testing.assert_allclose(free_time.objective, tf + 6 / tf**3, rtol=1e-13)
+    assert not failed(free_time.certificate)
+    assert "H at the end" in free_time.certificate.names
+
+
+def test_a_wrong_free_final_time_fails_its_row(free_time):
+    # Costates scaled by 1.001 keep H_u = 0 false too, but H(tf) = 0 is what this row is about.
+    spoiled = eqx.tree_at(lambda e: e.costate, free_time, free_time.costate * 1.001)
+    assert failed(spoiled.certificate)["H at the end"]["time"] == float(free_time.final_time)
+
+
+def bryson_ho(x0, y0, guess):
+    """Initial and final heading of Zermelo's problem in a shear current, in closed form.
+
+    **Source:** Bryson & Ho (1975), section 2.7, example 1, with V = h = 1.
+    """
+    sec = lambda a: 1 / np.cos(a)
+
+    def gap(z):
+        a, b = z
+        logarithm = np.log((np.tan(b) + sec(b)) / (np.tan(a) + sec(a)))
+        x = 0.5 * (sec(b) * (np.tan(b) - np.tan(a)) - np.tan(a) * (sec(b) - sec(a)) + logarithm)
+        return x - x0, sec(a) - sec(b) - y0
+
+    return optimize.fsolve(gap, guess, xtol=1e-14)
+
+
+def test_zermelo_with_newton_found_heading(zermelo):
+    assert not zermelo.problem.has_closed_form
+    start, end = bryson_ho(3.66, -1.86, np.radians([105, 240]))
+    turn = 2 * np.pi * np.round((zermelo.u[0, 0] - start) / (2 * np.pi))
+    np.testing.assert_allclose(zermelo.u[0, 0] - turn, start, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(zermelo.u[-1, 0] - turn, end, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        zermelo.final_time, np.tan(start) - np.tan(end), rtol=1e-10
+    )
+    assert not failed(zermelo.certificate)
+
+
+def test_a_free_component_of_the_initial_state():
+    """v(0) free: its costate is 0, so u = -3 t, v(0) = 3/2, J = 3/2."""
+    p = dataclasses.replace(DoubleIntegrator(), initial_state=(0.0, jg.Free()))
+    e = jg.solve(p, SMALL)
+    np.testing.assert_allclose(e.x[0], [0, 1.5], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(e.u[:, 0], -3 * np.asarray(e.t), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(e.objective, 1.5, rtol=1e-12)
+    assert not failed(e.certificate) and "transversality, start" in e.certificate.names
+
+
+class Forced(jg.Problem):
+    """x' = t u from t = 1, J = s x_f^2/2 + int (u^2/2 + x cos t): everything depends on time."""
+
+    s: float = 2.0
+    state_names = ("x",)
+    control_names = ("u",)
+    initial_time = 1.0
+    final_time = 2.5
+    initial_state = (0.7,)
+
+    def dynamics(self, t, x, u):
+        return t * u
+
+    def running_cost(self, t, x, u):
+        return 0.5 * u[0] ** 2 + x[0] * jnp.cos(t)
+
+    def endpoint_cost(self, x0, xf, t0, tf):
+        return 0.5 * self.s * xf[0] ** 2
+
+
+def test_running_and_endpoint_cost_with_time_dependent_dynamics():
+    e = jg.solve(Forced(), SMALL)
+    # lambda' = -cos t, lambda(T) = s x_f, u = -t lambda; so with L = lambda(T):
+    # x_f = x_0 - int t^2 (L + sin T - sin t) dt, linear in L.
+    a, b, s, x0 = 1.0, 2.5, 2.0, 0.7
+    primitive = lambda t: 2 * t * np.sin(t) + (2 - t * t) * np.cos(t)  # of t^2 sin t
+    cube = (b**3 - a**3) / 3
+    L = s * (x0 - cube * np.sin(b) + primitive(b) - primitive(a)) / (1 + s * cube)
+    lam = L + np.sin(b) - np.sin(np.asarray(e.t))
+    np.testing.assert_allclose(e.costate[:, 0], lam, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(e.u[:, 0], -np.asarray(e.t) * lam, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(e.x[-1, 0], L / s, rtol=0, atol=1e-12)
+    assert not failed(e.certificate)
+
+
+def test_scalar_lqr(scalar_lqr):
+    p = ScalarLQR()
+    # J = S(0) x_0^2/2, S by the Riccati equation; see riccati in test_gains for its solution.
+    w = math.sqrt(p.a**2 + p.q)
+    c = (p.s - p.a - w) / (p.s - p.a + w) * math.exp(-2 * w * p.final_time)
+    S = p.a + w * (1 + c) / (1 - c)
+    np.testing.assert_allclose(scalar_lqr.objective, S / 2, rtol=1e-12)
+    assert not failed(scalar_lqr.certificate)
+
+
+# Failures -------------------------------------------------------------------------------------
+
+
+def test_a_contradictory_end_names_its_constraint():
+    class Contradictory(DoubleIntegrator):
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return jnp.stack([xf[0] - 1.0, xf[0] - 2.0])
+
+    with pytest.raises(jg.SolveError) as caught:
+        jg.solve(Contradictory(), jg.Shooting(arcs=1, segments=4, starts=2))
+    message = str(caught.value)
+    assert "Contradictory" in message and "ndpoint constraint" in message and "relax" in message
+
+
+@pytest.mark.parametrize("r", [(1.0, -1.0), (1.0, 0.0)], ids=["negative", "singular"])
+def test_controls_that_do_not_minimise_are_flagged(regulator, r):
+    with pytest.raises(jg.SolveError, match="H_uu|boundary conditions"):
+        jg.solve(dataclasses.replace(Regulator(), r=r), SMALL)
+
+
+def test_not_minimising_is_told_apart(regulator):
+    e = jg.solve(dataclasses.replace(Regulator(), r=(1.0, -1.0)), SMALL, regulator, throw=False)
+    assert bool(e.result != jg.RESULTS.successful)
+
+
+def test_violated_bounds_are_flagged(double_integrator):
+    p = dataclasses.replace(DoubleIntegrator(), control_bounds=(-2.0, 2.0))
+    with pytest.raises(jg.SolveError, match="bounds"):
+        jg.solve(p, SMALL)
+    e = jg.solve(p, SMALL, throw=False)
+    assert bool(e.result == jg.RESULTS.bounds_violated)
+    assert list(failed(e.certificate)) == ["control bounds"]
+    p = dataclasses.replace(DoubleIntegrator(), state_bounds=(-1.0, (2.0, 1.0)))  # v reaches 1.5
+    e = jg.solve(p, SMALL, throw=False)
+    assert bool(e.result == jg.RESULTS.bounds_violated)
+    assert failed(e.certificate)["state bounds"]["where"] == "v"
+
+
+def test_float32_is_refused(double_integrator):
+    with jax.enable_x64(False):
+        with pytest.raises(RuntimeError, match="float64.*jax_enable_x64"):
+            jg.solve(DoubleIntegrator(), SMALL)
+        with pytest.raises(RuntimeError, match="float64.*jax_enable_x64"):
+            jg.gain_schedule(double_integrator, np.array([0.0, 0.5]))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"arcs": 3}, "segments=32 must be a multiple of arcs=3"),
+        ({"arcs": 0}, "arcs=0"),
+        ({"starts": 0}, "starts=0"),
+        ({"segments": 0}, "segments=0"),
+        ({"degree": 0}, "degree=0"),
+        ({"tolerance": -1.0}, "tolerance=-1.0"),
+    ],
+)
+def test_refuses_options(options, words):
+    with pytest.raises(ValueError, match=words):
+        jg.Shooting(**options)
+
+
+class Integrals(DoubleIntegrator):
+    def integrands(self, t, x, u):
+        return u
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (DoubleIntegrator(k=jg.Free(0.5, 2.0)), "DoubleIntegrator.k is a jg.Free"),
+        (DoubleIntegrator(final_time=math.inf), "final_time is infinite"),
+        (DoubleIntegrator(endpoint_bounds=(-1.0, 0.0)), "constraint 0 is an inequality"),
+        (Integrals(), "Integrals.integrands"),
+    ],
+)
+def test_refuses_what_shooting_cannot_do(problem, words):
+    with pytest.raises(ValueError, match=words):
+        jg.solve(problem, SMALL)
+
+
+def test_solve_refuses_a_bad_problem_at_once():
+    with pytest.raises(ValueError, match="final_time 0.0 is not after"):
+        jg.solve(FreeTime(final_time=0.0))
+
+
+def test_the_compiled_solve_traces_once(monkeypatch):
+    inner = eqx.debug.assert_max_traces(solving._run.__wrapped__, max_traces=1)
+    monkeypatch.setattr(solving, "_run", eqx.filter_jit(inner))
+    method = jg.Shooting(arcs=1, segments=4, starts=1)
+    for k in (1.0, 2.0, 3):
+        e = jg.solve(ScalarLQR(q=k), method)
+        assert bool(e.result == jg.RESULTS.successful)
