@@ -135,7 +135,7 @@ def gain_schedule(
     method: str = "segmented",
     nodes: int | None = None,
     segments: int = 64,
-    sweeps: int = 12,
+    sweeps: int = 8,
     parameters: tuple[str, ...] = (),
     tolerance: float = 1e-6,
 ) -> GainSchedule:

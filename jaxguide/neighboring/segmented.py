@@ -62,8 +62,10 @@ class Sweep(NamedTuple):
         i = self.locate(t)
         two_n = self.scale.shape[0]
         end = self.ends[i]
-        carried = self.transition(i, t) - _identity((two_n, end.shape[1]), end.dtype)
-        return end + end[:, :two_n] @ carried
+        moved = self.transition(i, t)
+        w = moved.shape[1]  # the target's columns beyond are constant
+        change = end[:, :two_n] @ (moved - _identity((two_n, w), end.dtype))
+        return end.at[:, :w].add(change)
 
 
 def _identity(shape: tuple[int, ...], dtype: Any) -> Array:
@@ -241,8 +243,7 @@ def solve_sweeps(
     where = [middle[None, :] + (widths / 2)[None, :] * tau[:, None] for tau in taus]
     everywhere = jnp.concatenate([where[0].reshape(-1), where[1].reshape(-1), times])
     c, convex = jax.vmap(lambda t: canonical_at(problem, t, extremal(t), parameters))(everywhere)
-    b = jnp.concatenate([c.b, jnp.zeros((*c.b.shape[:2], q), c.b.dtype)], axis=2)
-    M = jnp.concatenate([c.M * ratio[None], b / scale[None, :, None]], axis=2)
+    M = jnp.concatenate([c.M * ratio[None], c.b / scale[None, :, None]], axis=2)
     first, second = counts[0] * segments, sum(counts) * segments
     by_node = lambda a, s: a.reshape(s, segments, two_n, -1).transpose(0, 2, 3, 1)
     M1, M2 = by_node(M[:first], counts[0]), by_node(M[first:second], counts[1])
@@ -262,7 +263,8 @@ def solve_sweeps(
     if is_free(problem.final_time):
         rows = jnp.concatenate([rows, terminal.time[None]])
     rows = rows * constant[None, :]
-    ends = jax.vmap(lambda begin: join(rows, begin, n))(jnp.stack([begin1, begin2]))
+    begins = jnp.pad(jnp.stack([begin1, begin2]), ((0, 0), (0, 0), (0, q), (0, 0)))
+    ends = jax.vmap(lambda begin: join(rows, begin, n))(begins)
     pair = [
         Sweep(taus[1], breaks, slopes.transpose(3, 0, 1, 2), ends[i], scale)
         for i, slopes in enumerate((slopes1, slopes2))
