@@ -79,6 +79,12 @@ def symbol(name: str, prefix: str = "") -> str:
     return f"${prefix}{head}{tail}$"
 
 
+def costate_symbol(name: str) -> str:
+    """lambda with the state as its subscript."""
+    inner = symbol(name)
+    return rf"$\lambda_{{{inner[1:-1]}}}$" if inner.startswith("$") else rf"$\lambda$ of {inner}"
+
+
 def label(name: str, units: Units, prefix: str = "") -> str:
     """`symbol` with its unit."""
     unit = (units or {}).get(name, "")
@@ -107,12 +113,12 @@ def plot_extremal(extremal: Any, units: Units = None) -> Figure:
     panels = (
         ("control", np.asarray(extremal.u), controls, ""),
         ("state", np.asarray(extremal.x), states, ""),
-        ("costate", np.asarray(extremal.costate), states, r"\lambda\ "),
+        ("costate", np.asarray(extremal.costate), states, r"\lambda"),
     )
     figure, axes = _grid(3, 1, 2.1, sharex=True)
     for axis, (what, values, names, prefix) in zip(axes[:, 0], panels, strict=True):
         for i, name in enumerate(names):
-            text = symbol(name) if not prefix else rf"$\lambda$ of {symbol(name)}"
+            text = symbol(name) if not prefix else costate_symbol(name)
             unit = "" if prefix else (units or {}).get(name, "")
             axis.plot(t, values[:, i], label=f"{text} [{unit}]" if unit else text, **line(i))
         axis.set_ylabel(label(names[0], units) if len(names) == 1 and not prefix else what)
@@ -224,7 +230,7 @@ def plot_reoptimised(
         raise ValueError(f"{name!r} is no state; there are {states}.")
     i = states.index(name)
     values = np.asarray(flights.x)[:, :, i] - np.asarray(reoptimised)[:, :, i]
-    quantity = f"{symbol(name)} $-$ {symbol(name)} re-optimised"
+    quantity = f"{symbol(name)} minus re-optimised"
     unit = (units or {}).get(name, "")
     text = f"{quantity} [{unit}]" if unit else quantity
     return _cases(np.asarray(flights.t)[0], values, text, labels, units)
@@ -234,7 +240,7 @@ def _cases(
     t: np.ndarray, values: np.ndarray, text: str, labels: Sequence[str] | None, units: Units
 ) -> Figure:
     labels = [f"case {k + 1}" for k in range(len(values))] if labels is None else labels
-    figure, axes = _grid(1, 1, 3.0)
+    figure, axes = _grid(1, 1, 3.4)
     axis = axes[0, 0]
     axis.axhline(0.0, color="#808080", linewidth=0.6)
     for k, (row, text_k) in enumerate(zip(values, labels, strict=True)):
@@ -242,7 +248,8 @@ def _cases(
     axis.set_xlim(t[0], t[-1])
     axis.set_xlabel(label("t", units))
     axis.set_ylabel(text)
-    axis.legend(loc="best", ncols=2 if len(labels) > 3 else 1)
+    # Six curves leave no free corner, so the legend stands above.
+    figure.legend(loc="outside upper center", ncols=2 if len(labels) > 3 else 1)
     return figure
 
 
@@ -263,8 +270,8 @@ def plot_gain_errors(
             axis.loglog(points, values, marker=MARKERS[k], label=method, **line(k))
         axis.set_title(title)
         axis.set_xlabel(abscissa)
-        ticks = sorted({int(p) for points, _ in methods.values() for p in points})
-        ticks = [p for p in ticks if (p & (p - 1)) == 0] or ticks  # powers of two stay legible
+        sizes = [int(p) for points, _ in methods.values() for p in points]
+        ticks = [2**k for k in range(20) if min(sizes) <= 1.1 * 2**k and 2**k <= 1.1 * max(sizes)]
         axis.set_xticks(ticks, [str(p) for p in ticks])
         axis.minorticks_off()
     axes[0, 0].set_ylabel(ordinate)
@@ -309,29 +316,45 @@ def plot_sweep(dataset: Any, units: Units = None) -> Figure:
                 pair = np.ix_([j, i], [j, i])
                 _ellipse(axis, mean[[j, i]], sampled[pair], label="sampled", **line(0))
                 _ellipse(axis, np.zeros(2), linear[pair], label="linear", **line(2))
-            if i == n - 1:
-                axis.set_xlabel(label(names[j], units, r"\delta "))
-            elif j < i:
-                axis.tick_params(labelbottom=False)
-            if j == 0 and i > 0:
-                axis.set_ylabel(label(names[i], units, r"\delta "))
-            elif 0 < j < i:
-                axis.tick_params(labelleft=False)
             axis.locator_params(nbins=4)
-    for j in range(n):  # columns share their abscissa with the histogram above
-        low, high = axes[j, j].get_xlim()
-        for i in range(j + 1, n):
-            axes[i, j].set_xlim(low, high)
+    _align(axes, [label(name, units, r"\delta ") for name in names])
     handles: dict[str, Any] = {}
     for axis in axes.ravel():
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     if handles:
-        figure.legend(
-            list(handles.values()), list(handles), loc="upper right", bbox_to_anchor=(0.98, 0.93)
-        )
+        corner = {"loc": "upper right", "bbox_to_anchor": (0.98, 0.94)}
+        figure.legend(list(handles.values()), list(handles), **corner)
+    if len(values) > 1 and n > 1:
+        rows = ["standard deviation", f"{'':6}{'sampled':>12}{'linear':>12}"]
+        for name, a, b in zip(names, np.diag(sampled), np.diag(linear), strict=True):
+            rows.append(f"{name[:6]:6}{np.sqrt(max(a, 0)):12.3e}{np.sqrt(max(b, 0)):12.3e}")
+        place = {"va": "top", "family": "monospace", "fontsize": 7.0}
+        figure.text(0.39, 0.93, "\n".join(rows), **place)
     rate = f"{int(good.sum()):,} of {good.size:,} flights successful"
     figure.suptitle(f"Final state minus that of the undispersed flight; {rate}", fontsize=9.0)
     return figure
+
+
+def _align(axes: np.ndarray, texts: list[str]) -> None:
+    """Columns share their abscissa, rows of pairs their ordinate; only the outer axes say which."""
+    n = len(axes)
+    for j in range(n):
+        limits = [axes[i, j].get_xlim() for i in range(j, n)]
+        low, high = min(a for a, _ in limits), max(b for _, b in limits)
+        for i in range(j, n):
+            axes[i, j].set_xlim(low, high)
+            if i < n - 1:
+                axes[i, j].tick_params(labelbottom=False)
+                axes[i, j].xaxis.get_offset_text().set_visible(False)
+        axes[n - 1, j].set_xlabel(texts[j])
+    for i in range(1, n):
+        limits = [axes[i, j].get_ylim() for j in range(i)]
+        for j in range(i):
+            axes[i, j].set_ylim(min(a for a, _ in limits), max(b for _, b in limits))
+            if j > 0:
+                axes[i, j].tick_params(labelleft=False)
+                axes[i, j].yaxis.get_offset_text().set_visible(False)
+        axes[i, 0].set_ylabel(texts[i])
 
 
 def _histogram(axis: Axes, values: np.ndarray) -> None:

@@ -22,11 +22,12 @@ SMALL = jg.Shooting(arcs=2, segments=8, starts=4)
 
 
 class DoubleIntegrator(jg.Problem):
-    """x'' = k u, J = int u^2/2, to `target`. From rest over unit distance and time with k = 1:
-    u = 6 - 12 t, J = 6; the gain is (-6/T^2, -4/T), T the time left."""
+    """x'' = k u, J = int u^2/2, to C x = target. From rest over unit distance and time with
+    k = 1: u = 6 - 12 t, J = 6; the gain is (-6/T^2, -4/T), T the time left."""
 
     k: float = 1.0
     target: tuple = (1.0, 0.0)
+    C: tuple = (1.0, 0.0, 0.0, 1.0)  # by rows; identity
     state_names = ("x", "v")
     control_names = ("u",)
     initial_state = (0.0, 0.0)
@@ -38,7 +39,7 @@ class DoubleIntegrator(jg.Problem):
         return 0.5 * u[0] ** 2
 
     def endpoint_constraints(self, x0, xf, t0, tf):
-        return xf - jnp.stack(self.target)
+        return jnp.stack(self.C).reshape(2, 2) @ xf - jnp.stack(self.target)
 
 
 class FreeTime(DoubleIntegrator):
@@ -50,26 +51,32 @@ class FreeTime(DoubleIntegrator):
         return 1.0 + 0.5 * u[0] ** 2
 
 
-class ScalarLQR(jg.Problem):
-    """x' = a x + u, J = s x_f^2/2 + int (q x^2 + u^2)/2, no endpoint constraint: K = -S(t), S the
-    solution of the scalar Riccati equation."""
+class ForcedLQR(jg.Problem):
+    """x' = a x + u + d sin t, y' = y t/2, y(0) free, no endpoint constraint;
+    J = s x_f^2/2 + (y_f - 2)^2/2 + y_0^2/2 + int (q x^2 + u^2)/2 + c x cos t.
+
+    K = (-S(t), 0) with S of the scalar Riccati equation; y_0 = 2 g/(1 + g^2), g = y_f/y_0.
+    """
 
     a: float = 0.5
     q: float = 2.0
     s: float = 0.3
-    state_names = ("x",)
+    c: float = 1.0
+    d: float = 0.8
+    state_names = ("x", "y")
     control_names = ("u",)
-    final_time = 1.5
-    initial_state = (1.0,)
+    initial_time = 0.5
+    final_time = 2.0
+    initial_state = (1.0, jg.Free())
 
     def dynamics(self, t, x, u):
-        return self.a * x + u
+        return jnp.stack([self.a * x[0] + u[0] + self.d * jnp.sin(t), x[1] * t / 2])
 
     def running_cost(self, t, x, u):
-        return 0.5 * (self.q * x[0] ** 2 + u[0] ** 2)
+        return 0.5 * (self.q * x[0] ** 2 + u[0] ** 2) + self.c * x[0] * jnp.cos(t)
 
     def endpoint_cost(self, x0, xf, t0, tf):
-        return 0.5 * self.s * xf[0] ** 2
+        return 0.5 * (self.s * xf[0] ** 2 + (xf[1] - 2) ** 2 + x0[1] ** 2)
 
 
 class Regulator(jg.Problem):
@@ -120,6 +127,19 @@ class Zermelo(jg.Problem):
         return xf
 
 
+def zermelo_to_go(heading, end, xp=np):
+    """Position from which Zermelo's problem (V = h = 1) is left with `heading`, reaching the
+    origin with `end`; both point upstream (cos < 0). The time to go is tan(end) - tan(heading).
+
+    tan(heading) grows with time at V/h; the rest is quadrature of the sine and cosine.
+    **Source:** Bryson & Ho (1975), section 2.7.
+    """
+    a, b = xp.tan(heading), xp.tan(end)
+    sec_a, sec_b = 1 / xp.cos(heading), 1 / xp.cos(end)
+    x = xp.arcsinh(b) - xp.arcsinh(a) - sec_b * (b - a) + a * (sec_b - sec_a)
+    return xp.stack([x / 2, sec_a - sec_b])
+
+
 @pytest.fixture(scope="session")
 def earth_mars():
     return jg.solve(EarthMars(), jg.Shooting(starts=8))
@@ -136,8 +156,8 @@ def free_time():
 
 
 @pytest.fixture(scope="session")
-def scalar_lqr():
-    return jg.solve(ScalarLQR(), SMALL)
+def lqr():
+    return jg.solve(ForcedLQR(), SMALL)
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jaxguide as jg
 import numpy as np
 import pytest
-from conftest import SMALL, DoubleIntegrator, Regulator, ScalarLQR
+from conftest import SMALL, DoubleIntegrator, ForcedLQR, Regulator, zermelo_to_go
 from jaxguide.neighboring import gains as gains_module
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars import GAINS_EXACT, GAINS_LEAST_SQUARES, GAINS_SQUARE, relative
@@ -241,11 +241,14 @@ def riccati(p, T):
     return p.a + w * (1 + c) / (1 - c)
 
 
-def test_scalar_lqr(scalar_lqr):
-    times = np.array([0.0, 0.4, 1.0, 1.4, 1.49, 1.4999])
-    s = jg.gain_schedule(scalar_lqr, times)
+LQR_TIMES = 0.5 + np.array([0.0, 0.4, 1.0, 1.4, 1.49, 1.4999])
+
+
+def test_scalar_lqr(lqr):
+    s = jg.gain_schedule(lqr, LQR_TIMES)
     # No constraint at the end, so nothing is lost there.
-    np.testing.assert_allclose(s.K[:, 0, 0], -riccati(ScalarLQR(), 1.5 - times), rtol=1e-10)
+    np.testing.assert_allclose(s.K[:, 0, 0], -riccati(ForcedLQR(), 2 - LQR_TIMES), rtol=1e-10)
+    np.testing.assert_allclose(s.K[:, 0, 1], 0, atol=1e-12)  # y drives nothing
     assert s.K_target.shape == (6, 1, 0) and bool(s.resolved.all())
 
 
@@ -350,14 +353,7 @@ def test_free_final_time_against_re_solved(free_time):
 
 def test_zermelo_shortest_time_against_bryson_ho(zermelo):
     """Position to go is a function of the present and final headings; its inverse Jacobian is K."""
-
-    def to_go(z):
-        a, b = z
-        sec = lambda v: 1 / jnp.cos(v)
-        logarithm = jnp.log((jnp.tan(b) + sec(b)) / (jnp.tan(a) + sec(a)))
-        x = 0.5 * (sec(b) * (jnp.tan(b) - jnp.tan(a)) - jnp.tan(a) * (sec(b) - sec(a)) + logarithm)
-        return jnp.stack([x, sec(a) - sec(b)])
-
+    to_go = lambda z: zermelo_to_go(z[0], z[1], jnp)
     times = float(zermelo.final_time) * np.array([0.0, 0.2, 0.5, 0.7, 0.9, 0.99])
     s = jg.gain_schedule(zermelo, times)
     end = zermelo.u[-1, 0]
@@ -368,7 +364,7 @@ def test_zermelo_shortest_time_against_bryson_ho(zermelo):
         inverse = np.linalg.inv(jax.jacfwd(to_go)(z))
         # The log and secants are singular at 90 and 270 degrees only; near the end 1/T is lost.
         np.testing.assert_allclose(s.K[i, 0], inverse[0], rtol=1e-7, atol=1e-8)
-        slope = np.array([1 / np.cos(heading) ** 2, -1 / np.cos(end) ** 2])
+        slope = np.array([-1 / np.cos(heading) ** 2, 1 / np.cos(end) ** 2])  # of the time to go
         np.testing.assert_allclose(s.dtf_dx[i], slope @ inverse, rtol=1e-7, atol=1e-8)
 
 
@@ -494,9 +490,9 @@ def test_earth_mars_gain_differentiates_with_respect_to_thrust(earth_mars):
     np.testing.assert_allclose(slope, want, rtol=0, atol=1e-4 * np.abs(want).max())
 
 
-def test_the_compiled_sweep_traces_once(scalar_lqr, monkeypatch):
+def test_the_compiled_sweep_traces_once(lqr, monkeypatch):
     inner = eqx.debug.assert_max_traces(gains_module._segmented.__wrapped__, max_traces=1)
     monkeypatch.setattr(gains_module, "_segmented", eqx.filter_jit(inner))
     for end in (1.0, 1.2, 1.4):
-        s = jg.gain_schedule(scalar_lqr, np.linspace(0.0, end, 3), segments=8)
-        np.testing.assert_allclose(s.K[0, 0, 0], -riccati(ScalarLQR(), 1.5), rtol=1e-6)
+        s = jg.gain_schedule(lqr, np.linspace(0.5, end, 3), segments=8)
+        np.testing.assert_allclose(s.K[0, 0, 0], -riccati(ForcedLQR(), 1.5), rtol=1e-6)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import jaxguide as jg
 import numpy as np
 import pytest
-from conftest import SMALL, DoubleIntegrator, FreeTime, Regulator, ScalarLQR
-from jaxguide import solving
+from conftest import SMALL, DoubleIntegrator, ForcedLQR, FreeTime, Regulator, zermelo_to_go
+from jaxguide.nominal.shooting import _judge
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars import ANGLES, COSTATE_END, COSTATE_START, RADIUS
-from scipy import optimize
+from scipy import integrate, optimize
 
 # Earth-Mars at two times that are no nodes, with the sign of a minimised H; computed without this
 # package (see jaxguide/reproduce/earth_mars.py, whose numbers have the same source).
@@ -121,8 +121,9 @@ def test_a_spoiled_extremal_fails_in_the_right_row(earth_mars, row):
     certificate = spoiled.certificate
     bad = failed(certificate)
     assert row in bad and bad[row]["where"] == label
-    if node is not None:
-        assert bad[row]["time"] == float(earth_mars.t[node])
+    if node is not None:  # a shared node spoils both of its segments alike
+        near = (node, node + 12) if row.endswith("equation") else (node,)
+        assert bad[row]["time"] in [float(earth_mars.t[k]) for k in near]
     line = next(v for v in str(certificate).splitlines() if row in v)
     assert line.startswith("FAILS") and f"{label} at t = " in line
 
@@ -151,13 +152,6 @@ def test_single_shooting_from_rough_costates(earth_mars):
     np.testing.assert_allclose(e.costate[0], COSTATE_START, rtol=0, atol=1e-10)
 
 
-def test_an_extremal_of_a_similar_problem_as_guess(double_integrator):
-    near = dataclasses.replace(DoubleIntegrator(), k=2.0, final_time=1.5)
-    e = jg.solve(near, jg.Shooting(arcs=1, segments=4), guess=double_integrator)
-    # J = 6 d^2 / (k^2 T^3)
-    np.testing.assert_allclose(e.objective, 6 / (4 * 1.5**3), rtol=1e-12)
-
-
 def test_refuses_a_guess_of_the_wrong_shape():
     with pytest.raises(ValueError, match=r"guess has shape \(3,\); give an Extremal or the 2"):
         jg.solve(DoubleIntegrator(), SMALL, guess=jnp.zeros(3))
@@ -168,23 +162,26 @@ def test_refuses_a_guess_of_the_wrong_shape():
 
 @pytest.fixture(scope="module")
 def of_thrust(earth_mars):
-    """thrust -> (objective, costate(0)) of the re-solved Earth-Mars problem."""
-    method = jg.Shooting(arcs=4, segments=16)
+    """thrust -> (objective, costate(0), residual, result) of the re-solved Earth-Mars problem,
+    by single shooting from the nominal."""
+    method = jg.Shooting(arcs=1)
 
+    @eqx.debug.assert_max_traces(max_traces=4)  # a batch, one, and each way of differentiating
     def solve(thrust):
-        e = jg.solve(EarthMars(thrust=thrust), method, earth_mars, throw=False)
-        return e.objective, e.costate[0], e.residual
+        e = jg.solve(EarthMars(thrust=thrust), method, earth_mars)  # throws nothing: traced
+        return e.objective, e.costate[0], e.residual, e.result
 
     return solve
 
 
 @pytest.fixture(scope="module")
 def batch(of_thrust):
-    """100 thrusts within 2 per cent, the last four for finite differences."""
+    """100 thrusts within 2 per cent, the last four for finite differences. More than 64: a batch
+    of 64 is where vmapped LAPACK calls have hung."""
     h = 1e-3
     thrust = 0.1405 * (1 + 0.02 * np.random.default_rng(0).uniform(-1, 1, 96))
     thrust = jnp.asarray(np.append(thrust, 0.1405 + h * np.array([-2, -1, 1, 2])))
-    return h, thrust, jax.jit(jax.vmap(of_thrust))(thrust)
+    return h, thrust, eqx.filter_jit(jax.vmap(of_thrust))(thrust)
 
 
 def test_thrust_derivatives_both_ways(of_thrust, batch):
@@ -203,7 +200,7 @@ def test_thrust_derivatives_both_ways(of_thrust, batch):
     np.testing.assert_allclose(d_objective, -D_RADIUS_D_THRUST, rtol=0, atol=1e-9)
     np.testing.assert_allclose(reverse[0], -D_RADIUS_D_THRUST, rtol=0, atol=1e-9)
     np.testing.assert_allclose(reverse[1:], d_costate, rtol=1e-9)
-    h, _, (objective, costate, _) = batch
+    h, _, (objective, costate, *_) = batch
     # Central differences of fourth order: error h^4 f^(5)/30, some 1e-8 for derivatives that grow
     # by 1/thrust = 7 an order; rounding 1e-12/h = 1e-9.
     five_point = lambda f: (f[-4] - 8 * f[-3] + 8 * f[-2] - f[-1]) / (12 * h)
@@ -212,38 +209,27 @@ def test_thrust_derivatives_both_ways(of_thrust, batch):
 
 
 def test_vmap_equals_a_loop(of_thrust, batch):
-    _, thrust, (objective, costate, residual) = batch
+    _, thrust, (objective, costate, residual, result) = batch
     assert float(residual.max()) <= 1e-12  # all 100 converged
-    one = jax.jit(of_thrust)
+    assert set(np.asarray(result._value)) == {int(jg.RESULTS.successful._value)}
+    one = eqx.filter_jit(of_thrust)
     for i in (0, 33, 95):
         alone = one(thrust[i])
         np.testing.assert_allclose(objective[i], alone[0], rtol=1e-12)
         np.testing.assert_allclose(costate[i], alone[1], rtol=1e-11)  # conditioning of shooting
+    # Under a trace nothing is thrown: the result tells. (And nothing is traced anew.)
+    assert bool(one(jnp.asarray(jnp.nan))[3] == jg.RESULTS.not_converged)
+    assert bool(one(jnp.asarray(0.001))[3] == jg.RESULTS.not_converged)  # cannot leave the orbit
 
 
 @pytest.mark.slow
 def test_vmap_equals_a_loop_for_all(of_thrust, batch):
-    _, thrust, (objective, costate, _) = batch
-    one = jax.jit(of_thrust)
+    _, thrust, (objective, costate, *_) = batch
+    one = eqx.filter_jit(of_thrust)
     for i, k in enumerate(thrust):
         alone = one(k)
         np.testing.assert_allclose(objective[i], alone[0], rtol=1e-12)
         np.testing.assert_allclose(costate[i], alone[1], rtol=1e-11)
-
-
-def test_traced_solves_do_not_throw_and_do_not_retrace():
-    @eqx.debug.assert_max_traces(max_traces=1)
-    def solve(k, end):
-        p = dataclasses.replace(DoubleIntegrator(), k=k, target=(end, 0.0 * end))
-        e = jg.solve(p, jg.Shooting(arcs=1, segments=4, starts=1))  # throw=True, but traced
-        return e.objective, e.result
-
-    compiled = eqx.filter_jit(solve)
-    objective, result = compiled(jnp.asarray(2.0), jnp.asarray(1.0))
-    np.testing.assert_allclose(objective, 1.5, rtol=1e-12)  # 6 / k^2
-    assert bool(result == jg.RESULTS.successful)
-    _, result = compiled(jnp.asarray(2.0), jnp.asarray(jnp.nan))
-    assert bool(result == jg.RESULTS.not_converged)
 
 
 def test_new_parameters_compile_nothing(double_integrator, compilations):
@@ -292,112 +278,71 @@ def test_a_wrong_free_final_time_fails_its_row(free_time):
     assert failed(spoiled.certificate)["H at the end"]["time"] == float(free_time.final_time)
 
 
-def bryson_ho(x0, y0, guess):
-    """Initial and final heading of Zermelo's problem in a shear current, in closed form.
-
-    **Source:** Bryson & Ho (1975), section 2.7, example 1, with V = h = 1.
-    """
-    sec = lambda a: 1 / np.cos(a)
-
-    def gap(z):
-        a, b = z
-        logarithm = np.log((np.tan(b) + sec(b)) / (np.tan(a) + sec(a)))
-        x = 0.5 * (sec(b) * (np.tan(b) - np.tan(a)) - np.tan(a) * (sec(b) - sec(a)) + logarithm)
-        return x - x0, sec(a) - sec(b) - y0
-
-    return optimize.fsolve(gap, guess, xtol=1e-14)
-
-
 def test_zermelo_with_newton_found_heading(zermelo):
     assert not zermelo.problem.has_closed_form
-    start, end = bryson_ho(3.66, -1.86, np.radians([105, 240]))
-    turn = 2 * np.pi * np.round((zermelo.u[0, 0] - start) / (2 * np.pi))
-    np.testing.assert_allclose(zermelo.u[0, 0] - turn, start, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(zermelo.u[-1, 0] - turn, end, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(
-        zermelo.final_time, np.tan(start) - np.tan(end), rtol=1e-10
+    start, end = optimize.fsolve(
+        lambda z: zermelo_to_go(*z) - np.array([3.66, -1.86]), np.radians([105, 240]), xtol=1e-14
     )
+    heading = np.asarray(zermelo.u[:, 0])
+    heading = heading - 2 * np.pi * np.round((heading[0] - start) / (2 * np.pi))
+    # Shooting to 1e-12 of the boundary conditions; to go is well conditioned in the headings.
+    np.testing.assert_allclose(heading[[0, -1]], [start, end], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(zermelo.final_time, np.tan(end) - np.tan(start), rtol=1e-11)
     assert not failed(zermelo.certificate)
 
 
-def test_a_free_component_of_the_initial_state():
-    """v(0) free: its costate is 0, so u = -3 t, v(0) = 3/2, J = 3/2."""
-    p = dataclasses.replace(DoubleIntegrator(), initial_state=(0.0, jg.Free()))
-    e = jg.solve(p, SMALL)
-    np.testing.assert_allclose(e.x[0], [0, 1.5], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(e.u[:, 0], -3 * np.asarray(e.t), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(e.objective, 1.5, rtol=1e-12)
-    assert not failed(e.certificate) and "transversality, start" in e.certificate.names
+def test_forced_lqr_with_a_free_component_and_time_in_everything(lqr):
+    """Running and endpoint cost, dynamics that depend on time, a start other than 0."""
+    p, t0, tf = ForcedLQR(), 0.5, 2.0
 
+    def rates(t, z):  # costate of x = S x + g
+        S, g = z
+        forcing = S * p.d * np.sin(t) + p.c * np.cos(t)
+        return [S * S - 2 * p.a * S - p.q, -(p.a - S) * g - forcing]
 
-class Forced(jg.Problem):
-    """x' = t u from t = 1, J = s x_f^2/2 + int (u^2/2 + x cos t): everything depends on time."""
-
-    s: float = 2.0
-    state_names = ("x",)
-    control_names = ("u",)
-    initial_time = 1.0
-    final_time = 2.5
-    initial_state = (0.7,)
-
-    def dynamics(self, t, x, u):
-        return t * u
-
-    def running_cost(self, t, x, u):
-        return 0.5 * u[0] ** 2 + x[0] * jnp.cos(t)
-
-    def endpoint_cost(self, x0, xf, t0, tf):
-        return 0.5 * self.s * xf[0] ** 2
-
-
-def test_running_and_endpoint_cost_with_time_dependent_dynamics():
-    e = jg.solve(Forced(), SMALL)
-    # lambda' = -cos t, lambda(T) = s x_f, u = -t lambda; so with L = lambda(T):
-    # x_f = x_0 - int t^2 (L + sin T - sin t) dt, linear in L.
-    a, b, s, x0 = 1.0, 2.5, 2.0, 0.7
-    primitive = lambda t: 2 * t * np.sin(t) + (2 - t * t) * np.cos(t)  # of t^2 sin t
-    cube = (b**3 - a**3) / 3
-    L = s * (x0 - cube * np.sin(b) + primitive(b) - primitive(a)) / (1 + s * cube)
-    lam = L + np.sin(b) - np.sin(np.asarray(e.t))
-    np.testing.assert_allclose(e.costate[:, 0], lam, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(e.u[:, 0], -np.asarray(e.t) * lam, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(e.x[-1, 0], L / s, rtol=0, atol=1e-12)
-    assert not failed(e.certificate)
-
-
-def test_scalar_lqr(scalar_lqr):
-    p = ScalarLQR()
-    # J = S(0) x_0^2/2, S by the Riccati equation; see riccati in test_gains for its solution.
-    w = math.sqrt(p.a**2 + p.q)
-    c = (p.s - p.a - w) / (p.s - p.a + w) * math.exp(-2 * w * p.final_time)
-    S = p.a + w * (1 + c) / (1 - c)
-    np.testing.assert_allclose(scalar_lqr.objective, S / 2, rtol=1e-12)
-    assert not failed(scalar_lqr.certificate)
+    back = integrate.solve_ivp(
+        rates, (tf, t0), [p.s, 0.0], method="DOP853", rtol=1e-13, atol=1e-13, dense_output=True
+    )
+    for i in (0, 40, -1):
+        S, g = back.sol(float(lqr.t[i]))
+        x, lam = float(lqr.x[i, 0]), float(lqr.costate[i, 0])
+        # DOP853's dense output is of seventh order: 1e-10 between its steps.
+        np.testing.assert_allclose(lam, S * x + g, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(lqr.u[i, 0], -lam, rtol=1e-13)
+    forward = integrate.solve_ivp(
+        lambda t, x: p.a * x - back.sol(t)[0] * x - back.sol(t)[1] + p.d * np.sin(t),
+        (t0, tf), [1.0], method="DOP853", rtol=1e-12, atol=1e-12,
+    )  # fmt: skip
+    np.testing.assert_allclose(lqr.x[-1, 0], forward.y[0, -1], rtol=0, atol=1e-9)
+    g = np.exp((tf**2 - t0**2) / 4)
+    np.testing.assert_allclose(lqr.x[0], [1.0, 2 * g / (1 + g * g)], rtol=1e-12)
+    np.testing.assert_allclose(lqr.x[-1, 1], 2 * g * g / (1 + g * g), rtol=1e-12)
+    assert not failed(lqr.certificate) and "transversality, start" in lqr.certificate.names
 
 
 # Failures -------------------------------------------------------------------------------------
 
 
-def test_a_contradictory_end_names_its_constraint():
-    class Contradictory(DoubleIntegrator):
-        def endpoint_constraints(self, x0, xf, t0, tf):
-            return jnp.stack([xf[0] - 1.0, xf[0] - 2.0])
-
+def test_a_contradictory_end_names_its_constraint(double_integrator):
+    # x = 1 and x = 2
+    p = dataclasses.replace(DoubleIntegrator(), C=(1.0, 0.0, 1.0, 0.0), target=(1.0, 2.0))
     with pytest.raises(jg.SolveError) as caught:
-        jg.solve(Contradictory(), jg.Shooting(arcs=1, segments=4, starts=2))
+        jg.solve(p, SMALL)
     message = str(caught.value)
-    assert "Contradictory" in message and "ndpoint constraint" in message and "relax" in message
+    assert "DoubleIntegrator" in message and "ndpoint constraint" in message and "relax" in message
 
 
 @pytest.mark.parametrize("r", [(1.0, -1.0), (1.0, 0.0)], ids=["negative", "singular"])
-def test_controls_that_do_not_minimise_are_flagged(regulator, r):
+def test_controls_that_do_not_minimise_are_refused(regulator, r):
     with pytest.raises(jg.SolveError, match="H_uu|boundary conditions"):
         jg.solve(dataclasses.replace(Regulator(), r=r), SMALL)
 
 
-def test_not_minimising_is_told_apart(regulator):
-    e = jg.solve(dataclasses.replace(Regulator(), r=(1.0, -1.0)), SMALL, regulator, throw=False)
-    assert bool(e.result != jg.RESULTS.successful)
+def test_not_minimising_is_told_apart(earth_mars):
+    e = earth_mars
+    judge = lambda u: _judge(e.problem, e.t, e.x, u, e.costate, e.residual)
+    assert bool(judge(e.u) == jg.RESULTS.successful)
+    assert bool(judge(e.u + jnp.pi) == jg.RESULTS.not_minimising)  # H maximised
 
 
 def test_violated_bounds_are_flagged(double_integrator):
@@ -459,12 +404,3 @@ def test_refuses_what_shooting_cannot_do(problem, words):
 def test_solve_refuses_a_bad_problem_at_once():
     with pytest.raises(ValueError, match="final_time 0.0 is not after"):
         jg.solve(FreeTime(final_time=0.0))
-
-
-def test_the_compiled_solve_traces_once(monkeypatch):
-    inner = eqx.debug.assert_max_traces(solving._run.__wrapped__, max_traces=1)
-    monkeypatch.setattr(solving, "_run", eqx.filter_jit(inner))
-    method = jg.Shooting(arcs=1, segments=4, starts=1)
-    for k in (1.0, 2.0, 3):
-        e = jg.solve(ScalarLQR(q=k), method)
-        assert bool(e.result == jg.RESULTS.successful)

@@ -347,8 +347,8 @@ def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "2n n"]:
     """(dx, dlambda) at `t_to` per dx(t_from) on neighbouring extremals, segment by segment.
 
     Inside a segment y(r) = Psi(r)^-1 Psi(l) y(l), and Psi is symplectic: its inverse needs no
-    solve. At each break the costate is put back on S, which keeps growing modes out; inside the
-    last segment it is not, so that the end itself, where S may be infinite, is reached.
+    solve. At each break y is put back on G y = 0, which keeps growing modes out. (Putting the
+    costate back on S dx would do so too, but S may be infinite at the end.)
     """
     n = sweep.scale.shape[0] // 2
     two_n = 2 * n
@@ -359,8 +359,9 @@ def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "2n n"]:
         left = sweep.transition(i, l)[:, :two_n]
         right = sweep.transition(i, r)[:, :two_n]
         G = sweep.ends[i][:n, :two_n] @ left
-        S = -solve(G[:, n:], G[:, :n])
-        z = left @ jnp.concatenate([jnp.eye(n, dtype=S.dtype), S]) @ y[:n]
+        rows = _orthonormal_rows(G, n, two_n)
+        start = jnp.concatenate([jnp.eye(n, dtype=G.dtype), -solve(G[:, n:], G[:, :n])])
+        z = left @ jnp.where(i == first, start, y - rows.T @ (rows @ y))
         # inverse of [[a, b], [c, d]] symplectic is [[d^T, -b^T], [-c^T, a^T]]
         a, b, c, d = right[:n, :n], right[:n, n:], right[n:, :n], right[n:, n:]
         moved = jnp.concatenate([d.T @ z[:n] - b.T @ z[n:], a.T @ z[n:] - c.T @ z[:n]])
