@@ -258,6 +258,11 @@ def validate(problem: Problem) -> None:
     dtype = jnp.result_type(float)
     entries = problem.initial_state
     if entries is not None and not is_free(entries):
+        if not isinstance(entries, (tuple, list)) and jnp.ndim(entries) != 1:
+            raise ValueError(
+                f"{kind}.initial_state is {entries!r}; give one entry for each of the {n} states "
+                f"{problem.state_names}."
+            )
         size = len(entries) if isinstance(entries, (tuple, list)) else jnp.shape(entries)[0]
         if size != n:
             raise ValueError(
@@ -296,6 +301,13 @@ def validate(problem: Problem) -> None:
     if not tf > t0 and not is_free(problem.final_time) and not is_free(problem.initial_time):
         raise ValueError(
             f"{kind}: final_time {tf} is not after initial_time {t0}; the horizon must be positive."
+        )
+    latest = problem.final_time.hi if is_free(problem.final_time) else tf
+    earliest = problem.initial_time.lo if is_free(problem.initial_time) else t0
+    if not float(latest) > float(earliest):
+        raise ValueError(
+            f"{kind}: final_time is at most {float(latest)} and initial_time at least "
+            f"{float(earliest)}; the horizon must be positive."
         )
     u0 = start_control(problem, dtype)
     rate = np.asarray(problem.dynamics(jnp.asarray(t0, dtype), x0, u0))

@@ -2,6 +2,7 @@
 so tests perturb these (`dataclasses.replace` keeps the compiled program) and make few of their own.
 """
 
+import equinox as eqx
 import jax
 import matplotlib
 
@@ -138,6 +139,12 @@ def zermelo_to_go(heading, end, xp=np):
     sec_a, sec_b = 1 / xp.cos(heading), 1 / xp.cos(end)
     x = xp.arcsinh(b) - xp.arcsinh(a) - sec_b * (b - a) + a * (sec_b - sec_a)
     return xp.stack([x / 2, sec_a - sec_b])
+
+
+# Called op by op these compile for seconds each; as one program, once for each kind of object.
+at = eqx.filter_jit(lambda extremal, t: extremal(t))
+gain = eqx.filter_jit(lambda schedule, t: schedule(t))
+history = eqx.filter_jit(lambda schedule, t_k, t: schedule.history(t_k, t))
 
 
 @pytest.fixture(scope="session")

@@ -16,11 +16,14 @@ from jaxguide.montecarlo.sweep import case_key
 from scipy import stats
 
 STD = np.array([0.02, 0.01])
+# Full gains held over a tenth bring the double integrator home exactly (the last two samples are
+# deadbeat), which leaves nothing to compare.
+SCALE = 0.6
 
 
 @pytest.fixture(scope="module")
 def mission(double_integrator):
-    law = jg.NeighboringOptimal(jg.gain_schedule(double_integrator, np.arange(10) / 10), cap=10.0)
+    law = jg.NeighboringOptimal(jg.gain_schedule(double_integrator, np.arange(10) / 10), scale=SCALE)
     return jg.Mission(DoubleIntegrator(), law, (0.0, 0.0), 0.1)
 
 
@@ -32,7 +35,7 @@ def closed_loop():
     """d final / d initial of the double integrator with du = K dx held over ten samples."""
     F = np.eye(2)
     for t in np.arange(10) / 10:
-        K, h = np.array([[-6 / (1 - t) ** 2, -4 / (1 - t)]]), 0.1
+        K, h = SCALE * np.array([[-6 / (1 - t) ** 2, -4 / (1 - t)]]), 0.1
         F = (np.array([[1, h], [0, 1]]) + np.array([[h * h / 2], [h]]) @ K) @ F
     return F
 
@@ -51,7 +54,7 @@ def test_rollouts_are_the_single_flights(mission):
         alone = one(apply(mission, draws))
         # Lanes are contracted differently from single flights: rounding times gains of 600.
         np.testing.assert_allclose(flights.x[i], alone.x, rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(flights.x[i, 0], draws["initial_state"])
+        np.testing.assert_allclose(flights.x[i, 0], draws["initial_state"], rtol=1e-15)
         assert bool(alone.result == jg.RESULTS.successful)
     assert len(np.unique(np.asarray(flights.final_state)[:, 0])) == 4
 
@@ -76,10 +79,10 @@ def test_rollouts_differentiate(mission):
 
     def spread(std):
         f = jg.rollouts(mission, {"initial_state": jg.Normal(std * jnp.asarray(STD))}, keys)
-        return jnp.mean((f.final_state - jnp.array([1.0, 0.0])) ** 2)
+        return jnp.mean((f.final_state - jnp.array([[1.0, 0.0]])) ** 2)
 
     value, slope = jax.jit(jax.value_and_grad(spread))(jnp.asarray(1.0))
-    # The loop is linear and no command reaches the cap: the miss is proportional to std.
+    # The loop is linear: the miss is proportional to std.
     np.testing.assert_allclose(slope, 2 * value, rtol=1e-6)
     ratio = jax.jit(jax.vmap(spread))(jnp.array([1.0, 2.0]))
     np.testing.assert_allclose(ratio[1] / ratio[0], 4.0, rtol=1e-6)
@@ -183,7 +186,7 @@ def test_stored_draws_are_the_deviations_applied(mission, swept):
 
 
 def test_what_a_sweep_reports(swept):
-    assert dict(swept.sizes) == {"case": 20, "state": 2}
+    assert swept.final_state.sizes == {"case": 20, "state": 2}
     assert list(swept.state.values) == ["x", "v"]
     a = swept.attrs
     assert (a["cases"], a["seed"], a["failures"], a["success_rate"]) == (20, 7, {}, 1.0)
@@ -261,7 +264,8 @@ def test_linear_covariance_by_hand(mission):
     centre, P = jg.linear_covariance(mission, {"initial_state": jg.Normal(STD)})
     F = closed_loop()
     np.testing.assert_allclose(centre, [1, 0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(P, F @ np.diag(STD**2) @ F.T, rtol=1e-6, atol=1e-16)
+    np.testing.assert_allclose(P, F @ np.diag(STD**2) @ F.T, rtol=1e-6)
+    assert np.abs(F).max() > 0.01
     both = jg.linear_covariance(mission, DISPERSIONS)[1]
     only_k = jg.linear_covariance(mission, {"plant.k": jg.Uniform(-0.05, 0.05)})[1]
     np.testing.assert_allclose(both, P + only_k, rtol=1e-10)  # independent: variances add
@@ -271,9 +275,7 @@ def test_linear_covariance_against_a_sample(mission):
     count = 4096
     data = jg.sweep(mission, {"initial_state": jg.Normal(STD)}, count, 1, tile=1024)
     P, sampled = (np.array(data.attrs[k]) for k in ("linear_covariance", "sample_covariance"))
-    # The loop is linear and no command is limited (4 sigma: 6 * 0.08 + 4 * 0.04 < 10), so all that
-    # differs is sampling: a covariance has the standard error sqrt((P_ij^2 + P_ii P_jj)/(N - 1)).
-    assert float(data.saturated.max()) == 0
+    # The loop is linear, so all that differs is sampling: a covariance has the standard error sqrt((P_ij^2 + P_ii P_jj)/(N - 1)).
     d = np.diag(P)
     assert np.all(np.abs(sampled - P) <= 4 * np.sqrt((P**2 + np.outer(d, d)) / (count - 1)))
     mean = data.final_state.values.mean(axis=0)

@@ -34,6 +34,7 @@ def horizon(problem: Problem, z: Unknowns) -> tuple[Array, Array]:
     return t0, tf
 
 
+@jax.jit
 def canonical_rates(problem: Problem, t: Any, y: Float[Array, " 2n+1"]) -> Array:
     """d/dt of (x, lambda, cost): eqs (2), (6), with u from eq. (7)."""
     n = problem.n

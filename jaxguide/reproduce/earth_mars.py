@@ -825,5 +825,6 @@ def _overview(extremal: Extremal, schedule: GainSchedule, dataset: Any, plot: An
     ends.set_title(f"{int(good.sum()):,} dispersed flights")
     ends.set_xlabel("LU, LU/TU")
     ends.set_ylabel("flights")
-    ends.legend(loc="lower center")
+    ends.set_ylim(0.7, 2e6)  # room for the legend
+    ends.legend(loc="upper center")
     return figure
