@@ -44,7 +44,7 @@ class Trajectory(eqx.Module):
     reference_nodes: Float[Array, " p"]
 
     @property
-    def breaks(self) -> Float[Array, " segment+1"]:
+    def breaks(self) -> Float[Array, " edge"]:
         return self.t[:: self.reference_nodes.shape[0] - 1]
 
     @property

@@ -204,11 +204,16 @@ def test_a_second_sweep_compiles_nothing(mission, swept, compilations):
 
 
 def test_the_compiled_tile_traces_once(mission, monkeypatch):
-    inner = eqx.debug.assert_max_traces(sweep_module._fly_tile.__wrapped__, max_traces=1)
-    monkeypatch.setattr(sweep_module, "_fly_tile", eqx.filter_jit(inner))
-    small = {"initial_state": jg.Normal(0.01)}
-    for cases, seed in ((3, 0), (9, 1)):
-        jg.sweep(mission, small, cases, seed, tile=4)
+    inner = eqx.debug.assert_max_traces(sweep_module._fly_tile, max_traces=1)
+    monkeypatch.setattr(sweep_module, "_fly_tile", inner)
+    jg.sweep(mission, {"initial_state": jg.Normal(0.01)}, 9, 0, tile=4)  # three tiles
+
+
+def test_a_sweep_with_a_disturbance_given_as_a_function(mission):
+    pushed = dataclasses.replace(mission, disturbance=lambda t, x: jnp.array([0.0, 0.5]))
+    still, moved = (jg.sweep(m, DISPERSIONS, 2, 7, tile=2) for m in (mission, pushed))
+    # The push of 0.5 moves every case alike, up to the gains' answer to it.
+    assert np.all(moved.final_state.values[:, 1] > still.final_state.values[:, 1] + 1e-3)
 
 
 class Cliff(DoubleIntegrator):

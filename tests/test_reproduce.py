@@ -125,7 +125,7 @@ def test_figures_draw(name, tmp_path):
     assert isinstance(figure, Figure)
     figure.savefig(tmp_path / "figure.png", dpi=50)
     for axis in figure.axes:
-        lines = [line for line in axis.get_lines() if not line.get_label().startswith("_")]
+        lines = [line for line in axis.get_lines() if not str(line.get_label()).startswith("_")]
         dashes = [str(line._dash_pattern) for line in lines]  # pyright: ignore
         assert len(set(dashes)) == len(dashes)  # told apart without colour
 
@@ -134,7 +134,9 @@ def test_units_and_names_on_the_axes():
     figure = plotting.plot_extremal(extremal(), UNITS)
     assert figure.axes[-1].get_xlabel() == "$t$ [TU]"
     assert figure.axes[0].get_ylabel() == r"$\epsilon$ [rad]"
-    texts = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    legend = figure.axes[1].get_legend()
+    assert legend is not None
+    texts = [text.get_text() for text in legend.get_texts()]
     assert texts == ["$r$ [LU]", "$v_{r}$ [LU/TU]", "$v_{t}$ [LU/TU]"]
 
 

@@ -20,8 +20,8 @@ class Flight(eqx.Module):
     control and its deviation as commanded at each sample; `saturated` (): samples at the cap.
     """
 
-    t: Float[Array, " sample+1"]
-    x: Float[Array, "sample+1 n"]
+    t: Float[Array, " instant"]
+    x: Float[Array, "instant n"]
     u: Float[Array, "sample m"]
     commands: Float[Array, "sample m"]
     final_state: Float[Array, " n"]
@@ -41,7 +41,7 @@ class _Carry(eqx.Module):
 class Prepared(NamedTuple):
     """Sample times of a mission and its law made ready for them: shared by a batch of flights."""
 
-    times: Float[Array, " sample+1"]
+    times: Float[Array, " instant"]
     grid: SampleGrid
     laws: Law | None
 
@@ -130,7 +130,7 @@ def simulate(
     return Flight(t, x, us, dus, final, times[-1], end.saturated, end.result)
 
 
-def sample_times(mission: Mission) -> Float[Array, " sample+1"]:
+def sample_times(mission: Mission) -> Float[Array, " instant"]:
     """min(t0 + k interval, tf) for k = 0 ... max_samples; the last is tf."""
     count = jnp.arange(mission.max_samples + 1).astype(mission.initial_state.dtype)
     times = mission.initial_time + mission.sample_interval * count

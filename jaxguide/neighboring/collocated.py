@@ -11,11 +11,11 @@ from jaxguide.trajectory import Extremal
 
 
 def assemble(
-    D: Float[Array, "N+1 N+1"],
+    D: Float[Array, "point point"],
     half: Float[Array, ""],
-    M: Float[Array, "N+1 2n 2n"],
-    psi: Float[Array, "n 2n"],
-) -> Float[Array, "n(2N+3) 2n(N+1)"]:
+    M: Float[Array, "point two_n two_n"],
+    psi: Float[Array, "n two_n"],
+) -> Float[Array, "row column"]:
     """V of eq. (40): canonical equations (36), (37) at all LGL points, then the end conditions.
 
     Unknowns Z = (X, Lambda), each stacked node by node (eq. 35).

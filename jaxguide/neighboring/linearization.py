@@ -85,9 +85,9 @@ def second_variation(
 class Canonical(NamedTuple):
     """y' = M y + b dp for y = (dx, dlambda), and du = U y + U_p dp: eqs (16)-(21)."""
 
-    M: Float[Array, "2n 2n"]
-    b: Float[Array, "2n p"]
-    U: Float[Array, "m 2n"]
+    M: Float[Array, "two_n two_n"]
+    b: Float[Array, "two_n p"]
+    U: Float[Array, "m two_n"]
     U_p: Float[Array, "m p"]
 
 
@@ -116,10 +116,10 @@ def _inverse_times(h_uu: Array, rows: Array) -> Array:
 class Terminal(NamedTuple):
     """End conditions psi y + psi_p dp + psi_target dpsi = 0 and the change of the final time."""
 
-    psi: Float[Array, "n 2n"]
+    psi: Float[Array, "n two_n"]
     psi_p: Float[Array, "n p"]
     psi_target: Float[Array, "n q"]
-    time: Float[Array, "2n+p+q"]
+    time: Float[Array, "deviation"]
 
 
 def terminal_conditions(extremal: Extremal, parameters: tuple[str, ...] = ()) -> Terminal:
@@ -186,7 +186,7 @@ class LinearTPBVP(eqx.Module):
     A: Float[Array, "time n n"]
     B: Float[Array, "time n n"]
     Q: Float[Array, "time n n"]
-    U: Float[Array, "time m 2n"]
+    U: Float[Array, "time m two_n"]
     psi_x: Float[Array, "n n"]
     psi_lambda: Float[Array, "n n"]
     dtf_dx: Float[Array, " n"]

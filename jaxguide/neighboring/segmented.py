@@ -39,17 +39,17 @@ class Sweep(NamedTuple):
     """One solution of the adjoint rows: everything needed to evaluate them at any time."""
 
     nodes: Float[Array, " s"]
-    breaks: Float[Array, " segment+1"]
-    slopes: Float[Array, "segment s 2n w"]  # (Psi(t_j) - I) / (t_e - t_j), Psi = Phi(t_e, t)
+    breaks: Float[Array, " edge"]
+    slopes: Float[Array, "segment s two_n w"]  # (Psi(t_j) - I) / (t_e - t_j), Psi = Phi(t_e, t)
     ends: Float[Array, "segment row w"]  # G at each segment's end
-    scale: Float[Array, " 2n"]  # y = scale * scaled y
+    scale: Float[Array, " two_n"]  # y = scale * scaled y
 
     def locate(self, t: Array) -> Array:
         last = self.breaks.shape[0] - 2
         after = jnp.searchsorted(self.breaks, t, side="right", method="compare_all")
         return jnp.clip(after - 1, 0, last)
 
-    def transition(self, i: Array, t: Array) -> Float[Array, "2n w"]:
+    def transition(self, i: Array, t: Array) -> Float[Array, "two_n w"]:
         """Phi(t_e, t) with the columns of parameters, scaled, inside segment `i`."""
         a, b = self.breaks[i], self.breaks[i + 1]
         tau = (2 * t - a - b) / jnp.where(b > a, b - a, 1.0)
@@ -80,7 +80,7 @@ def canonical_at(
     return canonical(v), cholesky_positive(v.H_uu)
 
 
-def scaling(extremal: Extremal, M: Float[Array, "probe 2n 2n"]) -> Float[Array, " 2n"]:
+def scaling(extremal: Extremal, M: Float[Array, "probe two_n two_n"]) -> Float[Array, " two_n"]:
     """Units in which M is balanced: states by their size, costates so that B and Q match."""
     n = extremal.problem.n
     size = jnp.max(jnp.abs(extremal.x), axis=0)
@@ -94,8 +94,8 @@ def scaling(extremal: Extremal, M: Float[Array, "probe 2n 2n"]) -> Float[Array, 
 
 
 def place_breaks(
-    t: Float[Array, " probe"], M: Float[Array, "probe 2n 2n"], segments: int
-) -> Float[Array, " segment+1"]:
+    t: Float[Array, " probe"], M: Float[Array, "probe two_n two_n"], segments: int
+) -> Float[Array, " edge"]:
     r"""Breaks that equidistribute $|M'|/|M| + \sqrt{|M''|/|M|} + |M|$, with a floor.
 
     The first two are the inverse length over which M changes; |M| bounds the Picard contraction.
@@ -135,9 +135,9 @@ def _gauss_integration(s: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def collocate(
-    M: Float[Array, "s 2n w segment"],
+    M: Float[Array, "s two_n w segment"],
     widths: Float[Array, " segment"],
-    start: Float[Array, "s 2n w segment"] | None,
+    start: Float[Array, "s two_n w segment"] | None,
     sweeps: int,
 ) -> tuple[Array, Array]:
     """Phi(t_e, t) with parameter columns, at the Gauss nodes and at the segment's start."""
@@ -176,7 +176,7 @@ def _orthonormal_rows(G: Array, n: int, two_n: int) -> Array:
 
 
 def join(
-    terminal: Float[Array, "row w"], transitions: Float[Array, "2n w segment"], n: int
+    terminal: Float[Array, "row w"], transitions: Float[Array, "two_n w segment"], n: int
 ) -> Float[Array, "segment row w"]:
     """G at the segments' ends, from the end conditions backwards."""
     two_n, w, segments = transitions.shape
@@ -291,9 +291,9 @@ def _probe_times(extremal: Extremal) -> Array:
 class Gains(NamedTuple):
     """Costate and control per deviation of state, parameters and target, at one time."""
 
-    S: Float[Array, "n w-n"]
-    K: Float[Array, "m w-n"]
-    time: Float[Array, " w-n"]
+    S: Float[Array, "n known"]
+    K: Float[Array, "m known"]
+    time: Float[Array, " known"]
     rounding: Float[Array, ""]
 
 
@@ -343,7 +343,7 @@ def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
     return jnp.any(later & (at_breaks != baseline)[None, :], axis=1) | (at_times != baseline)
 
 
-def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "2n n"]:
+def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "two_n n"]:
     """(dx, dlambda) at `t_to` per dx(t_from) on neighbouring extremals, segment by segment.
 
     Inside a segment y(r) = Psi(r)^-1 Psi(l) y(l), and Psi is symplectic: its inverse needs no

@@ -13,10 +13,10 @@ from jaxguide.problem import Problem, bounds_of, hamiltonian, initial_values, is
 class Unknowns(NamedTuple):
     """What shooting solves for: state and costate at the start of each arc, nu, free times."""
 
-    starts: Float[Array, "arc 2n"]
+    starts: Float[Array, "arc two_n"]
     nu: Float[Array, " q"]
-    t0: Float[Array, " 0_or_1"]
-    tf: Float[Array, " 0_or_1"]
+    t0: Float[Array, " chosen"]
+    tf: Float[Array, " chosen"]
 
 
 def number_of_constraints(problem: Problem) -> int:
@@ -35,7 +35,7 @@ def horizon(problem: Problem, z: Unknowns) -> tuple[Array, Array]:
 
 
 @jax.jit
-def canonical_rates(problem: Problem, t: Any, y: Float[Array, " 2n+1"]) -> Array:
+def canonical_rates(problem: Problem, t: Any, y: Float[Array, " two_n_1"]) -> Array:
     """d/dt of (x, lambda, cost): eqs (2), (6), with u from eq. (7)."""
     n = problem.n
     x, costate = y[:n], y[n : 2 * n]
@@ -59,7 +59,7 @@ def optimal_hamiltonian(problem: Problem, t: Any, y: Array) -> Array:
     return hamiltonian(problem, t, y[:n], u, y[n : 2 * n])
 
 
-def boundary_residual(problem: Problem, z: Unknowns, ends: Float[Array, "arc 2n+1"]) -> Array:
+def boundary_residual(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:
     """Everything that must vanish: initial state, continuity, eq. (3), transversality (8), (9).
 
     With H minimised, eq. (8) reads lambda(tf) = +dEbar/dx; a free initial component has

@@ -43,7 +43,7 @@ def rk4(rate: Any, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:
     return jnp.concatenate([y[None], ys])
 
 
-def coarse_ends(problem: Problem, z: Unknowns, steps: int) -> Float[Array, "arc 2n+1"]:
+def coarse_ends(problem: Problem, z: Unknowns, steps: int) -> Float[Array, "arc two_n_1"]:
     """Each arc's end by fixed Runge-Kutta steps: good enough to choose among starts."""
     arcs = z.starts.shape[0]
     t0, tf = horizon(problem, z)
@@ -196,7 +196,7 @@ def damped_newton(
     return unravel(v), norm, cost
 
 
-def objective(problem: Problem, z: Unknowns, ends: Float[Array, "arc 2n+1"]) -> Array:
+def objective(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:
     """E plus the integral of F, from the arcs' ends."""
     n = problem.n
     t0, tf = horizon(problem, z)

@@ -300,9 +300,11 @@ def at(extremal: Extremal, t: np.ndarray, sign: float = 1.0) -> tuple[Point, Sys
     parts = []
     for k in range(0, len(t), CHUNK):
         padded = np.pad(t[k : k + CHUNK], (0, max(0, k + CHUNK - len(t))), mode="edge")
-        parts.append(jax.device_get(_at(extremal, padded)))
+        parts.append(jax.device_get(_at(extremal, jnp.asarray(padded))))
     n = extremal.problem.n
-    points = Point(*(np.concatenate(a)[: len(t)] for a in zip(*(p for p, _ in parts), strict=True)))
+    points = jax.tree_util.tree_map(
+        lambda *a: np.concatenate(a)[: len(t)], *(point for point, _ in parts)
+    )
     join = lambda name: np.concatenate([getattr(v, name) for _, v in parts])[: len(t)]
     f_x, f_u, H_xx, H_xu, H_uu = (join(name) for name in ("f_x", "f_u", "H_xx", "H_xu", "H_uu"))
     swap = lambda a: a.transpose(0, 2, 1)
@@ -334,7 +336,7 @@ def horizon(t: np.ndarray, system: System, square: bool = False) -> np.ndarray:
     if square:
         W = -np.linalg.solve(Ve, V0)
     else:  # R of [Ve V0] holds all that least squares needs; Q is never formed
-        R = np.linalg.qr(np.concatenate([Ve, V0], axis=1), mode="r")
+        R: Any = np.linalg.qr(np.concatenate([Ve, V0], axis=1), mode="r")
         W = -np.linalg.solve(R[:-n, :-n], R[:-n, -n:])
     return np.concatenate([np.eye(n), W]).reshape(points, two_n, n)
 
@@ -399,14 +401,14 @@ def segmented_gains(extremal: Extremal, tau: float) -> dict[int, np.ndarray]:
 
 
 @jax.jit
-def _breaks(t: Array, M: Array) -> Float[Array, "size segment+1"]:
+def _breaks(t: Array, M: Array) -> Float[Array, "size break"]:
     breaks = [place_breaks(t, M, s) for s in SEGMENTS]
     longest = SEGMENTS[-1] + 1
     return jnp.stack([jnp.pad(b, (0, longest - b.shape[0]), mode="edge") for b in breaks])
 
 
 @jax.jit
-def _across(M: Array, widths: Array) -> Float[Array, "size 2n 2n segment"]:
+def _across(M: Array, widths: Array) -> Float[Array, "size row column segment"]:
     return jax.vmap(lambda M, w: collocate(M, w, None, 12)[1])(M, widths)
 
 
@@ -465,7 +467,14 @@ class Tabulated(Law):
     def __call__(self, t_k: Any, x: Array, memory: None) -> tuple["TabulatedCommand", None]:
         k = jnp.round(t_k / self.interval).astype(int)
         one = jax.tree_util.tree_map(lambda a: a[k], self.table)
-        command = TabulatedCommand(self, one, t_k, x - one.x, RESULTS.successful, jnp.array(False))
+        command = TabulatedCommand(
+            law=self,
+            one=one,
+            t_k=t_k,
+            dx=x - one.x,
+            result=RESULTS.successful,
+            saturated=jnp.array(False),
+        )
         return command, None
 
 
@@ -496,7 +505,13 @@ class Clocked(Hold):
     kind: Array
 
     def __call__(self, command: Command, t_k: Any) -> "ClockedCommand":
-        return ClockedCommand(command, t_k, self.kind, command.result, command.saturated)
+        return ClockedCommand(
+            command=command,
+            t_k=t_k,
+            kind=self.kind,
+            result=command.result,
+            saturated=command.saturated,
+        )
 
 
 class ClockedCommand(Command):
