@@ -28,8 +28,10 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
     `SolveError` (with what missed, by how much and what to try) when no extremal was found.
     """
     require_x64("jg.solve")
-    validate(problem)
     method = Shooting() if method is None else method
+    if isinstance(problem, Problem):
+        method.check_fields(problem)
+    validate(problem)
     method.check(problem)
     problem = with_array_leaves(problem)
     if is_traced((problem, guess)):

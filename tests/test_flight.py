@@ -6,10 +6,11 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxguide as jg
 import numpy as np
 import pytest
 from conftest import DoubleIntegrator, FreeTime, at
+
+import jaxguide as jg
 from jaxguide.montecarlo.sweep import cast
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars import CASES, FINAL_ERRORS, REOPTIMISED
@@ -70,7 +71,13 @@ def test_a_command_keeps_the_deviation_apart(law):
     def ask(law, t):
         command, memory = law(0.2, jnp.array([0.2, 0.5]), law.start(jnp.zeros(2)))
         assert memory is None
-        return command.nominal(t), command.deviation(t), command(t), command.result, command.saturated
+        return (
+            command.nominal(t),
+            command.deviation(t),
+            command(t),
+            command.result,
+            command.saturated,
+        )
 
     x = at(law.schedule.extremal, jnp.asarray(0.2)).x
     dx = np.array([0.2, 0.5]) - np.asarray(x)
@@ -197,7 +204,9 @@ def test_a_plant_unlike_the_law_s_own(mission):
     flown = eqx.tree_at(lambda m: m.plant.k, mission, jnp.asarray(1.05))
     miss = lambda flight: np.abs(np.asarray(flight.final_state) - [1, 0])
     closed = miss(simulate(flown))
-    opened = miss(simulate(dataclasses.replace(flown, law=jg.OpenLoop(mission.law.schedule.extremal))))
+    opened = miss(
+        simulate(dataclasses.replace(flown, law=jg.OpenLoop(mission.law.schedule.extremal)))
+    )
     # Feedback at ten samples takes out most of a 5 per cent error of the plant.
     assert np.all(closed[0] < 0.2 * opened[0])
 
@@ -225,7 +234,11 @@ def test_sensor_and_estimator(mission):
     sensed = dataclasses.replace(mission, sensor=Noise(jnp.asarray(0.01)))
     with pytest.raises(ValueError, match="needs a PRNG key; pass key="):
         jg.simulate(sensed)
-    noisy, again, other = simulate(sensed, key), simulate(sensed, key), simulate(sensed, jax.random.key(6))
+    noisy, again, other = (
+        simulate(sensed, key),
+        simulate(sensed, key),
+        simulate(sensed, jax.random.key(6)),
+    )
     np.testing.assert_array_equal(noisy.commands, again.commands)
     assert not np.allclose(noisy.commands, other.commands)
     # The first command by hand: K(0) of what the sensor shows, not of the state.
@@ -245,7 +258,9 @@ def test_sensor_and_estimator(mission):
 @pytest.mark.parametrize("hold", [jg.HoldDeviation(), jg.History()], ids=["held", "history"])
 def test_fixed_steps_converge_at_fourth_order_to_adaptive(law, hold):
     fly = lambda integrator: np.asarray(
-        simulate(jg.Mission(Drag(drag=0.5), law, START, 0.25, hold=hold, integrator=integrator)).final_state
+        simulate(
+            jg.Mission(Drag(drag=0.5), law, START, 0.25, hold=hold, integrator=integrator)
+        ).final_state
     )
     exact = fly(jg.Adaptive(1e-13))
     errors = [np.abs(fly(jg.RungeKutta4(steps)) - exact).max() for steps in (2, 4, 8)]
@@ -258,9 +273,9 @@ def test_fixed_steps_converge_at_fourth_order_to_adaptive(law, hold):
 def test_samples_outside_the_schedule_fly_alike(double_integrator):
     """Gains known at few times: both integrators must take the same gain at every sample."""
     sparse = jg.NeighboringOptimal(jg.gain_schedule(double_integrator, np.linspace(0.2, 0.6, 10)))
-    fly = lambda integrator: simulate(
-        jg.Mission(DoubleIntegrator(), sparse, START, 0.1, integrator=integrator)
-    ).commands
+    fly = lambda integrator: (
+        simulate(jg.Mission(DoubleIntegrator(), sparse, START, 0.1, integrator=integrator)).commands
+    )
     np.testing.assert_allclose(fly(jg.RungeKutta4()), fly(jg.Adaptive()), rtol=1e-7, atol=1e-9)
 
 
@@ -281,7 +296,12 @@ def paper_schedule(earth_mars):
 
 def final_errors(earth_mars, schedule, hold, integrator):
     mission = jg.Mission(
-        EarthMars(), jg.NeighboringOptimal(schedule), (1.0, 0.0, 1.0), 0.02, hold=hold, integrator=integrator
+        EarthMars(),
+        jg.NeighboringOptimal(schedule),
+        (1.0, 0.0, 1.0),
+        0.02,
+        hold=hold,
+        integrator=integrator,
     )
 
     @eqx.filter_jit
@@ -297,7 +317,9 @@ def check_table(errors, name):
     want = np.array(FINAL_ERRORS[name])
     # 1 per cent or 2e-9, as the reference itself was computed.
     assert np.all(np.abs(errors - want) <= np.maximum(0.01 * np.abs(want), 2e-9)), errors - want
-    assert np.all(errors[:, 0] > 0)  # r(tf) cannot beat the optimum's by a constraint miss this small
+    assert np.all(
+        errors[:, 0] > 0
+    )  # r(tf) cannot beat the optimum's by a constraint miss this small
 
 
 @pytest.mark.parametrize(
@@ -419,7 +441,9 @@ class Wall(DoubleIntegrator):
         return jnp.stack([x[1], u[0] + jnp.where(inside, jnp.inf, 0.0)])
 
 
-@pytest.mark.parametrize("integrator", [jg.RungeKutta4(), jg.Adaptive(1e-9)], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize(
+    "integrator", [jg.RungeKutta4(), jg.Adaptive(1e-9)], ids=["fixed", "adaptive"]
+)
 def test_a_diverging_plant_is_flagged_and_held(law, integrator):
     flight = simulate(jg.Mission(Wall(height=1.0), law, START, 0.1, integrator=integrator))
     assert bool(flight.result == jg.RESULTS.diverged)
@@ -440,12 +464,26 @@ def test_one_diverging_lane_leaves_the_others(law):
     others = np.array([0, 1, 3, 4, 5])
     np.testing.assert_array_equal(bad.x[others], good.x[others])
     diverged = int(jg.RESULTS.diverged._value)
-    assert [int(c) == diverged for c in bad.result._value] == [False, False, True, False, False, False]
+    assert [int(c) == diverged for c in bad.result._value] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
 def test_float32_flights_stay_float32(mission):
     flight = simulate(cast(mission, "float32"))
-    for leaf in (flight.t, flight.x, flight.u, flight.commands, flight.final_state, flight.saturated):
+    for leaf in (
+        flight.t,
+        flight.x,
+        flight.u,
+        flight.commands,
+        flight.final_state,
+        flight.saturated,
+    ):
         assert leaf.dtype == jnp.float32
     want, _, _ = by_hand(START, SAMPLES, "deviation")
     # Gains of 600 times rounding of 1e-7 in the last sample, times its length.
@@ -464,4 +502,6 @@ def test_a_mission_is_arrays_only_and_passes_through_jit(mission):
     assert all(eqx.is_array(leaf) for leaf in jax.tree_util.tree_leaves(mission))
     flight = jax.jit(lambda m: jg.simulate(m))(mission)
     # inlined or not, the same operations: rounding only
-    np.testing.assert_allclose(flight.final_state, simulate(mission).final_state, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        flight.final_state, simulate(mission).final_state, rtol=0, atol=1e-13
+    )

@@ -5,14 +5,15 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxguide as jg
 import numpy as np
 import pytest
 from conftest import SMALL, DoubleIntegrator, ForcedLQR, Regulator, at, gain, history, zermelo_to_go
+from scipy.integrate import solve_ivp
+
+import jaxguide as jg
 from jaxguide.neighboring import gains as gains_module
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars import GAINS_EXACT, GAINS_LEAST_SQUARES, GAINS_SQUARE, relative
-from scipy.integrate import solve_ivp
 
 PAPER_TIMES = np.asarray(list(GAINS_EXACT))
 # End conditions of the reference file: eq. (15) with H maximised, so the costate's sign changes.
@@ -55,7 +56,9 @@ def test_the_papers_gains(earth_mars, method, wanted):
             assert relative(gain(s, jnp.asarray(t))[0], wanted[t]) <= 1e-8, t
     # Wrong in the first digit before the turn (up to 0.5 relative), right from tau = 2 on: the
     # schedule must know.
-    true = np.array([relative(K, GAINS_EXACT[t]) for t, K in zip(PAPER_TIMES, s.K[:, 0], strict=True)])
+    true = np.array(
+        [relative(K, GAINS_EXACT[t]) for t, K in zip(PAPER_TIMES, s.K[:, 0], strict=True)]
+    )
     assert true[0] > 0.05 and not bool(s.resolved[0])
     np.testing.assert_array_equal(s.resolved[PAPER_TIMES >= 2], True)
     np.testing.assert_allclose(s.error[:4], true[:4], rtol=1e-4)
@@ -159,7 +162,10 @@ def test_between_times_the_schedule_is_as_good_as_at_them(schedule, at_paper_tim
     for t in (0.111, 1.687, 2.5, 3.2001):
         # Same sweep, evaluated elsewhere; both within their errors of the truth.
         fine = float(jnp.interp(t, schedule.times, schedule.error))
-        assert relative(gain(at_paper_times, jnp.asarray(t))[0], gain(schedule, jnp.asarray(t))[0]) <= 1e-8 + fine
+        assert (
+            relative(gain(at_paper_times, jnp.asarray(t))[0], gain(schedule, jnp.asarray(t))[0])
+            <= 1e-8 + fine
+        )
     for i in (0, 5, 165):
         assert relative(gain(schedule, schedule.times[i])[0], schedule.K[i, 0]) <= 1e-9
     same = [gain(schedule, jnp.asarray(t)) for t in (-1.0, 0.0)]
@@ -236,7 +242,9 @@ def test_double_integrator_collocated(double_integrator, method):
     want = np.stack([-6 / T**2, -4 / T], axis=1)
     error = np.abs(s.K[:, 0] - want).max(axis=1) / np.abs(want).max(axis=1)
     assert np.all(error[:4] <= 1e-10) and error[4] <= 1e-6 and error[5] <= 1e-4
-    np.testing.assert_allclose(history(s, jnp.asarray(0.25), jnp.asarray(1.0))[0], [6 / 0.75**2, 2 / 0.75], rtol=1e-8)
+    np.testing.assert_allclose(
+        history(s, jnp.asarray(0.25), jnp.asarray(1.0))[0], [6 / 0.75**2, 2 / 0.75], rtol=1e-8
+    )
     np.testing.assert_allclose(gain(s, jnp.asarray(0.6))[0], [-6 / 0.4**2, -4 / 0.4], rtol=1e-8)
 
 
@@ -280,9 +288,7 @@ def test_two_controls_against_closed_forms(regulator):
 
 def test_a_long_unstable_horizon_keeps_its_gain(regulator):
     # e^40 = 2e17: without normalising, the rows are lost altogether.
-    s = regulated(
-        regulator, a=(1.0, 1.0), q=(0.0, 1.0), final_time=40.0, initial_state=(0.0, 0.0)
-    )
+    s = regulated(regulator, a=(1.0, 1.0), q=(0.0, 1.0), final_time=40.0, initial_state=(0.0, 0.0))
     a, w, T = 1.0, np.sqrt([1.0, 2.0]), 40 * (1 - REGULATOR_PARTS)[:, None]
     want = -(a + w / np.tanh(w * T))
     got = np.diagonal(s.K, axis1=1, axis2=2)
@@ -347,11 +353,18 @@ def test_free_final_time_against_re_solved(free_time):
     h = 1e-4
     for i in range(2):
         up, down = (
-            jg.solve(dataclasses.replace(free_time.problem, initial_state=tuple(sign * h * np.eye(2)[i])), SMALL)
+            jg.solve(
+                dataclasses.replace(
+                    free_time.problem, initial_state=tuple(sign * h * np.eye(2)[i])
+                ),
+                SMALL,
+            )
             for sign in (1, -1)
         )
         # h^2 f'''/6 with derivatives of order 10 to 100: 1e-7; rounding 1e-14/h = 1e-10.
-        np.testing.assert_allclose(s.K[0, 0, i], (up.u[0, 0] - down.u[0, 0]) / (2 * h), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(
+            s.K[0, 0, i], (up.u[0, 0] - down.u[0, 0]) / (2 * h), rtol=1e-6, atol=1e-9
+        )
         np.testing.assert_allclose(
             s.dtf_dx[0, i], (up.final_time - down.final_time) / (2 * h), rtol=1e-6, atol=1e-9
         )

@@ -5,15 +5,16 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxguide as jg
 import numpy as np
 import pytest
 from conftest import DoubleIntegrator
+from scipy import stats
+
+import jaxguide as jg
 from jaxguide.montecarlo import sweep as sweep_module
 from jaxguide.montecarlo.rollouts import apply, draw
 from jaxguide.montecarlo.statistics import percentile_bounds, summarise, wilson_bounds
 from jaxguide.montecarlo.sweep import case_key
-from scipy import stats
 
 STD = np.array([0.02, 0.01])
 # Full gains held over a tenth bring the double integrator home exactly (the last two samples are
@@ -23,7 +24,9 @@ SCALE = 0.6
 
 @pytest.fixture(scope="module")
 def mission(double_integrator):
-    law = jg.NeighboringOptimal(jg.gain_schedule(double_integrator, np.arange(10) / 10), scale=SCALE)
+    law = jg.NeighboringOptimal(
+        jg.gain_schedule(double_integrator, np.arange(10) / 10), scale=SCALE
+    )
     return jg.Mission(DoubleIntegrator(), law, (0.0, 0.0), 0.1)
 
 
@@ -96,7 +99,10 @@ def test_rollouts_differentiate(mission):
         ({"sensor": jg.Normal(1.0)}, "'sensor' is not one array"),
         ({"max_samples": jg.Normal(1.0)}, "'max_samples' is not one array"),
         ({"plant.target.7": jg.Normal(1.0)}, "no '7'"),
-        ({"initial_state": jg.Normal(np.ones(3))}, r"std of shape \(3,\) does not fit a leaf of \(2,\)"),
+        (
+            {"initial_state": jg.Normal(np.ones(3))},
+            r"std of shape \(3,\) does not fit a leaf of \(2,\)",
+        ),
         ({"initial_state": jg.MultivariateNormal(np.eye(3))}, r"cov is \(3, 3\).*shape \(2,\)"),
     ],
 )
@@ -193,7 +199,9 @@ def test_what_a_sweep_reports(swept):
     assert a["success_rate_bounds"][1] == 1.0 and a["success_rate_bounds"][0] < 0.9
     finals = swept.final_state.values
     np.testing.assert_allclose(a["percentiles"]["x"]["mean"], finals[:, 0].mean(), rtol=1e-14)
-    np.testing.assert_allclose(a["percentiles"]["v"]["p50"]["value"], np.median(finals[:, 1]), rtol=1e-14)
+    np.testing.assert_allclose(
+        a["percentiles"]["v"]["p50"]["value"], np.median(finals[:, 1]), rtol=1e-14
+    )
     np.testing.assert_allclose(a["sample_covariance"], np.cov(finals.T), rtol=1e-12)
 
 
@@ -280,7 +288,8 @@ def test_linear_covariance_against_a_sample(mission):
     count = 4096
     data = jg.sweep(mission, {"initial_state": jg.Normal(STD)}, count, 1, tile=1024)
     P, sampled = (np.array(data.attrs[k]) for k in ("linear_covariance", "sample_covariance"))
-    # The loop is linear, so all that differs is sampling: a covariance has the standard error sqrt((P_ij^2 + P_ii P_jj)/(N - 1)).
+    # The loop is linear, so all that differs is sampling: a covariance has the standard error
+    # sqrt((P_ij^2 + P_ii P_jj)/(N - 1)).
     d = np.diag(P)
     assert np.all(np.abs(sampled - P) <= 4 * np.sqrt((P**2 + np.outer(d, d)) / (count - 1)))
     mean = data.final_state.values.mean(axis=0)

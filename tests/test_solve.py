@@ -1,4 +1,4 @@
-"""Extremals: against independent numbers and closed forms; their certificates; their derivatives."""
+"""Extremals: against independent numbers and closed forms; certificates; derivatives."""
 
 import dataclasses
 import math
@@ -6,14 +6,15 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxguide as jg
 import numpy as np
 import pytest
 from conftest import SMALL, DoubleIntegrator, ForcedLQR, FreeTime, Regulator, at, zermelo_to_go
+from scipy import integrate, optimize
+
+import jaxguide as jg
 from jaxguide.nominal.shooting import _judge
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars import ANGLES, COSTATE_END, COSTATE_START, RADIUS
-from scipy import integrate, optimize
 
 # Earth-Mars at two times that are no nodes, with the sign of a minimised H; computed without this
 # package (see jaxguide/reproduce/earth_mars.py, whose numbers have the same source).
@@ -91,13 +92,14 @@ def test_certificate_passes_and_prints(earth_mars):
     assert "FAILS" not in text and len(text.splitlines()) == len(certificate.names)
 
 
-def _spoil(where, by):
-    return lambda e: eqx.tree_at(where, e, replace_fn=by)
-
-
 BREAK = 12 * 12  # a node shared by two segments of 12th degree
 SPOILED = {  # row: how to break it, what and where it must name
-    "costate equation": (lambda e: e.costate, lambda v: v.at[BREAK, 1].add(1e-6), "costate of v_r", BREAK),
+    "costate equation": (
+        lambda e: e.costate,
+        lambda v: v.at[BREAK, 1].add(1e-6),
+        "costate of v_r",
+        BREAK,
+    ),
     "state equation": (lambda e: e.x, lambda v: v.at[BREAK, 2].add(1e-6), "v_t", BREAK),
     "stationarity H_u": (lambda e: e.u, lambda v: v.at[BREAK + 5].add(1e-6), "epsilon", BREAK + 5),
     "transversality, end": (
@@ -110,15 +112,18 @@ SPOILED = {  # row: how to break it, what and where it must name
     "endpoint constraints": (lambda e: e.x, lambda v: v.at[-1, 2].add(1e-6), "constraint 1", -1),
     "Legendre-Clebsch": (lambda e: e.u, lambda v: v + jnp.pi, "-min eig H_uu", None),
     "spectral tail, state": (lambda e: e.x, lambda v: v.at[BREAK + 5, 0].add(1e-6), "r", None),
-    "control bounds": (lambda e: e.problem.control_bounds, lambda v: 0.5 * jnp.sign(v), "epsilon", -1),
+    "control bounds": (
+        lambda e: e.problem.control_bounds,
+        lambda bounds: tuple(0.5 * jnp.sign(b) for b in bounds),
+        "epsilon",
+        -1,
+    ),
 }
 
 
 @pytest.mark.parametrize("row", SPOILED)
 def test_a_spoiled_extremal_fails_in_the_right_row(earth_mars, row):
     where, change, label, node = SPOILED[row]
-    if row == "control bounds":
-        change = lambda bounds: tuple(jnp.sign(b) * 0.5 for b in bounds)
     spoiled = eqx.tree_at(where, earth_mars, change(where(earth_mars)))
     certificate = spoiled.certificate
     bad = failed(certificate)
@@ -220,8 +225,8 @@ def test_vmap_equals_a_loop(of_thrust, batch):
         np.testing.assert_allclose(objective[i], alone[0], rtol=1e-12)
         np.testing.assert_allclose(costate[i], alone[1], rtol=1e-11)  # conditioning of shooting
     # Under a trace nothing is thrown: the result tells. (And nothing is traced anew.)
-    assert bool(one(jnp.asarray(jnp.nan))[3] == jg.RESULTS.not_converged)
-    assert bool(one(jnp.asarray(0.001))[3] == jg.RESULTS.not_converged)  # cannot leave the orbit
+    assert bool(one(thrust[0] * jnp.nan)[3] == jg.RESULTS.not_converged)
+    assert bool(one(0.01 * thrust[0])[3] == jg.RESULTS.not_converged)  # cannot leave the orbit
 
 
 @pytest.mark.slow
@@ -283,7 +288,7 @@ def test_a_wrong_free_final_time_fails_its_row(free_time):
 def test_zermelo_with_newton_found_heading(zermelo):
     assert not zermelo.problem.has_closed_form
     start, end = optimize.fsolve(
-        lambda z: zermelo_to_go(*z) - np.array([3.66, -1.86]), np.radians([105, 240]), xtol=1e-14
+        lambda z: zermelo_to_go(*z) - np.array([3.66, -1.86]), np.radians([105, 240]), xtol=1e-13
     )
     heading = np.asarray(zermelo.u[:, 0])
     heading = heading - 2 * np.pi * np.round((heading[0] - start) / (2 * np.pi))

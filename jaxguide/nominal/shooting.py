@@ -24,7 +24,7 @@ from jaxguide.nominal.guess import coarse_ends, damped_newton, objective, random
 from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free, start_value
 from jaxguide.spectral import nodes_lgl
 from jaxguide.trajectory import Extremal, Multipliers
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, is_traced
 
 
 class Shooting(eqx.Module):
@@ -55,15 +55,20 @@ class Shooting(eqx.Module):
     max_steps: int = eqx.field(static=True, default=1024)
 
     def __check_init__(self):
-        if self.arcs < 1 or self.segments % self.arcs:
+        if self.arcs < 1 or self.segments < 1 or self.segments % self.arcs:
             raise ValueError(
                 f"Shooting: segments={self.segments} must be a multiple of arcs={self.arcs} >= 1."
             )
-        if self.starts < 1:
-            raise ValueError(f"Shooting: starts={self.starts}; need at least 1.")
+        for name in ("starts", "coarse_steps", "max_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Shooting: {name}={getattr(self, name)}; need at least 1.")
+        if self.degree < 2:
+            raise ValueError(f"Shooting: degree={self.degree}; need at least 2.")
+        if not 0 < self.tolerance < 1:
+            raise ValueError(f"Shooting: tolerance={self.tolerance}; give one in (0, 1).")
 
-    def check(self, problem: Problem) -> None:
-        """Refuses what indirect shooting cannot do. Host only."""
+    def check_fields(self, problem: Problem) -> None:
+        """Refuses fields that shooting cannot choose, before anything is evaluated. Host only."""
         kind = type(problem).__name__
         fixed = ("initial_time", "final_time", "initial_state")
         for name, value in vars(problem).items():
@@ -73,6 +78,12 @@ class Shooting(eqx.Module):
                     "optimise; give it a number, or add it as a state with zero rate and a free "
                     "initial value."
                 )
+
+    def check(self, problem: Problem) -> None:
+        """Refuses what indirect shooting cannot do. Host only."""
+        kind = type(problem).__name__
+        if is_traced((problem.final_time, problem.endpoint_bounds)):
+            return
         if not is_free(problem.final_time) and np.any(np.isinf(np.asarray(problem.final_time))):
             raise ValueError(
                 f"{kind}.final_time is infinite; shooting needs a finite one (try some ten time "
@@ -201,7 +212,8 @@ class Shooting(eqx.Module):
             ends = jax.vmap(lambda ys, i: ys[i])(solution.ys, last)
             return boundary_residual(problem, z, ends), (solution.ts, solution.ys)
 
-        z, (ts, ys) = _newton(residual, z, problem)
+        better, (ts, ys) = _newton(residual, z, problem)
+        z = _if_finite(better, z)
         # Break where the solver stepped: equal numbers of its steps per segment, mixed with
         # uniform spacing as a floor.
         t0, tf = horizon(problem, z)
@@ -246,7 +258,7 @@ class Shooting(eqx.Module):
         def residual(z: Unknowns, problem: Problem) -> tuple[Array, None]:
             return boundary_residual(problem, z, fly(z, problem)[:, -1]), None
 
-        z, _ = _newton(residual, z, problem)
+        z = _if_finite(_newton(residual, z, problem)[0], z)
         arcs = fly(z, problem)
         y = jnp.concatenate([arcs[:, :-1].reshape(-1, arcs.shape[2]), arcs[-1, -1:]])
         t0, tf = horizon(problem, z)
@@ -287,6 +299,12 @@ def _newton(residual: Any, z: Unknowns, problem: Problem) -> tuple[Unknowns, Any
         throw=False,
     )
     return solution.value, solution.aux
+
+
+def _if_finite(new: Unknowns, old: Unknowns) -> Unknowns:
+    """`new`, or `old` where Newton met a singular Jacobian: a failure then shows what it missed."""
+    ok = jnp.all(jnp.isfinite(jax.flatten_util.ravel_pytree(new)[0]))
+    return jax.tree_util.tree_map(lambda a, b: jnp.where(ok, a, b), new, old)
 
 
 def _dopri8(problem: Problem, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:

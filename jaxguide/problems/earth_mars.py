@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
 from jaxguide.flight.mission import Mission
 from jaxguide.laws.neighboring import NeighboringOptimal
@@ -24,10 +25,10 @@ class EarthMars(Problem):
     **Source:** Yan, Fahroo & Ross (2002), eqs (50)-(56), after Bryson & Ho (1975).
     """
 
-    thrust: float = 0.1405
-    mass_flow: float = 0.0749
-    mass: float = 1.0
-    mu: float = 1.0
+    thrust: ArrayLike = 0.1405
+    mass_flow: ArrayLike = 0.0749
+    mass: ArrayLike = 1.0
+    mu: ArrayLike = 1.0
     state_names = ("r", "v_r", "v_t")
     control_names = ("epsilon",)
     initial_time = 0.0
