@@ -87,7 +87,9 @@ def main() -> None:
     fly = jax.jit(lambda m: jg.simulate(m).final_state)
     out["closed_loop_flight_ms"] = 1e3 * best_of(lambda: fly(perturbed), repeats)
     with_gains = jax.jit(lambda e, x: jg.simulate(
-        eqx.tree_at(lambda m: (m.law.schedule, m.initial_state), loop, (jg.gain_schedule(e, times), x))
+        eqx.tree_at(
+            lambda m: (m.law.schedule, m.initial_state), loop, (jg.gain_schedule(e, times), x)
+        )
     ).final_state)  # fmt: skip
     out["closed_loop_with_gains_ms"] = 1e3 * best_of(
         lambda: with_gains(extremal, perturbed.initial_state), repeats
