@@ -98,6 +98,7 @@ def configure() -> None:
     # A computation that holds an `eqx.error_if` is a host callback, which is never cached. The
     # library reports failures as values, so none is needed.
     os.environ.setdefault("EQX_ON_ERROR", "nan")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else idle pools spin beside XLA
     import jax
 
     jax.config.update("jax_enable_x64", True)

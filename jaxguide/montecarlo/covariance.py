@@ -1,5 +1,6 @@
 """Linear covariance of a closed loop: what the dispersions do to first order."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -10,6 +11,7 @@ from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.rollouts import apply, draw
 
 
+@eqx.filter_jit
 def linear_covariance(
     mission: Mission, dispersions: dict[str, Distribution]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
