@@ -1,5 +1,9 @@
 """Dispersed flights: the same numbers one by one, in batches and in tiles; statistics of them."""
 
+# Tests hand over what a type checker would refuse, on purpose.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportAssignmentType=false
+
 import dataclasses
 
 import equinox as eqx

@@ -1,5 +1,9 @@
 """How users state a problem, and what they are told when it is stated badly."""
 
+# Tests hand over what a type checker would refuse, on purpose.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportAssignmentType=false
+
 import dataclasses
 import math
 
