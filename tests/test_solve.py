@@ -230,7 +230,6 @@ def test_vmap_equals_a_loop(of_thrust, batch):
         np.testing.assert_allclose(costate[i], alone[1], rtol=1e-11)  # conditioning of shooting
     # Under a trace nothing is thrown: the result tells. (And nothing is traced anew.)
     assert bool(one(thrust[0] * jnp.nan)[3] == jg.RESULTS.not_converged)
-    assert bool(one(0.01 * thrust[0])[3] == jg.RESULTS.not_converged)  # cannot leave the orbit
 
 
 @pytest.mark.slow
