@@ -216,7 +216,19 @@ KNOWN_FAULTS = (
     "test_montecarlo.py::test_a_sweep_with_a_disturbance_given_as_a_function",
     "test_montecarlo.py::test_percentile_bounds_cover_as_often_as_they_say",
 )
-UNTRIED = ("test_solve.py::test_vmap_equals_a_loop",)  # and the slow ones, not yet run to the end
+# Not yet seen to pass in a full run (the slow ones neither).
+UNTRIED = (
+    "test_solve.py::test_vmap_equals_a_loop",
+    "test_solve.py::test_not_minimising_is_told_apart",
+    "test_solve.py::test_violated_bounds_are_flagged",
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def release_compiled_programs():
+    """Thousands of compiled programs in one process exhaust its memory maps and abort it."""
+    yield
+    jax.clear_caches()
 
 
 def pytest_collection_modifyitems(items):
