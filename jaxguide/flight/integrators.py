@@ -88,6 +88,12 @@ class Adaptive(Integrator):
     tolerance: float = eqx.field(static=True, default=1e-11)
     max_steps: int = eqx.field(static=True, default=1024)
 
+    def __check_init__(self):
+        if not 0 < self.tolerance < 1:
+            raise ValueError(f"Adaptive: tolerance is {self.tolerance}; give one in (0, 1).")
+        if self.max_steps < 1:
+            raise ValueError(f"Adaptive: max_steps is {self.max_steps}; give at least 1.")
+
     @property
     def stages(self) -> None:
         return None

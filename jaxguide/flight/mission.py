@@ -108,6 +108,11 @@ class Mission(eqx.Module):
                 float(np.asarray(initial_time)),
                 float(np.asarray(final_time)),
             )
+            if max_samples is not None and max_samples < count:
+                raise ValueError(
+                    f"Mission: max_samples is {max_samples}, but the horizon holds {count} samples; "
+                    "give at least as many, or leave it out."
+                )
             max_samples = count if max_samples is None else max_samples
         if max_samples is None:
             raise ValueError(

@@ -96,6 +96,7 @@ def simulate(
         else:
             new = _adaptive(mission, flown, command, is_last, t, t_next, x)
         finite = jnp.isfinite(sum(new[1:], new[0]))  # one test: NaN and inf survive a sum
+        finite = finite & (carry.result != RESULTS.diverged)  # once diverged, held
         new = tuple(jnp.where(finite, b, a) for a, b in zip(carry.x, new, strict=True))
         result = RESULTS.where(carry.result == RESULTS.successful, command.result, carry.result)
         result = RESULTS.where(finite, result, RESULTS.diverged)

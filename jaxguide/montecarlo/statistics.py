@@ -18,10 +18,10 @@ def percentile_bounds(values: np.ndarray, percent: float, confidence: float = 0.
     count, p = ordered.size, percent / 100
     z = _normal_quantile(0.5 + confidence / 2)
     spread = z * math.sqrt(count * p * (1 - p))
-    low = min(max(math.floor(count * p - spread), 0), count - 1)
-    high = min(max(math.ceil(count * p + spread), 0), count - 1)
+    low, high = math.floor(count * p - spread) - 1, math.ceil(count * p + spread)
+    bound = lambda rank, beyond: float(ordered[rank]) if 0 <= rank < count else beyond
     value = float(np.quantile(ordered, p))
-    return {"value": value, "low": float(ordered[low]), "high": float(ordered[high])}
+    return {"value": value, "low": bound(low, -math.inf), "high": bound(high, math.inf)}
 
 
 def wilson_bounds(successes: int, count: int, confidence: float = 0.95) -> tuple[float, float]:

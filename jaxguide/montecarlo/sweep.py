@@ -74,15 +74,21 @@ def sweep(
     key = jax.random.key(seed)
     began = time.perf_counter()
     prepared = _prepare(mission, dispersions)
+    # What is not an array (a disturbance given as a function, say) is part of the program.
+    given, rest = eqx.partition((mission, dispersions, prepared), eqx.is_array)
+
+    def tile_of(given: Any, key: Array, index: Array) -> dict[str, Any]:
+        return _fly_tile(*eqx.combine(given, rest), key, index, tile)
+
     fly = (
-        jax.jit(_fly_tile, static_argnums=5)
-        .lower(mission, dispersions, prepared, key, jnp.asarray(0), tile)
+        jax.jit(tile_of)
+        .lower(given, key, jnp.asarray(0))
         .compile(compiler_options=compiler_options())
     )
     compile_s = time.perf_counter() - began
 
     began = time.perf_counter()
-    one = lambda i: jax.device_get(fly(mission, dispersions, prepared, key, jnp.asarray(i)))
+    one = lambda i: jax.device_get(fly(given, key, jnp.asarray(i)))
     parts = over_cores(one, tiles, progress)
     elapsed = time.perf_counter() - began
     joined = jax.tree_util.tree_map(lambda *leaves: np.concatenate(leaves)[:cases], *parts)

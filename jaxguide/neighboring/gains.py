@@ -165,6 +165,8 @@ def gain_schedule(
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}.")
     if segments < 8 or segments % 8:
         raise ValueError(f"segments is {segments}; give a positive multiple of 8.")
+    if sweeps < 1:
+        raise ValueError(f"sweeps is {sweeps}; give at least 1.")
     if times.ndim != 1 or times.shape[0] == 0:
         raise ValueError(f"times has shape {times.shape}; give a vector (T,) with T >= 1.")
     if not is_traced((times, extremal.t)):

@@ -39,7 +39,8 @@ def parameter_values(problem: Problem, names: tuple[str, ...], dtype: Any) -> Fl
     """
     known = [f.name for f in dataclasses.fields(problem)]
     for name in names:
-        if name not in known or jnp.shape(getattr(problem, name)) != ():
+        value = getattr(problem, name, None)
+        if name not in known or isinstance(value, (tuple, list, str)) or jnp.shape(value) != ():
             raise ValueError(
                 f"{name!r} is not a scalar parameter of {type(problem).__name__}; fields: {known}."
             )
