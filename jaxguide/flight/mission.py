@@ -110,8 +110,8 @@ class Mission(eqx.Module):
             )
             if max_samples is not None and max_samples < count:
                 raise ValueError(
-                    f"Mission: max_samples is {max_samples}, but the horizon holds {count} samples; "
-                    "give at least as many, or leave it out."
+                    f"Mission: max_samples is {max_samples}, but the horizon holds {count} "
+                    "samples; give at least as many, or leave it out."
                 )
             max_samples = count if max_samples is None else max_samples
         if max_samples is None:
@@ -164,6 +164,6 @@ def with_leaf(tree: Any, path: str, change: Any) -> Any:
         return node
 
     leaf = where(tree)
-    if leaf is None or len(jax.tree_util.tree_leaves(leaf)) != 1:
+    if leaf is None or isinstance(leaf, (int, str)) or len(jax.tree_util.tree_leaves(leaf)) != 1:
         raise ValueError(f"{path!r} is not one array of the mission; name a leaf below it.")
     return eqx.tree_at(where, tree, change(leaf))

@@ -1,5 +1,6 @@
 """`jg.sweep`: many dispersed flights in fixed tiles, and their statistics. Host only."""
 
+import functools
 import os
 import time
 from collections.abc import Callable
@@ -76,19 +77,13 @@ def sweep(
     prepared = _prepare(mission, dispersions)
     # What is not an array (a disturbance given as a function, say) is part of the program.
     given, rest = eqx.partition((mission, dispersions, prepared), eqx.is_array)
-
-    def tile_of(given: Any, key: Array, index: Array) -> dict[str, Any]:
-        return _fly_tile(*eqx.combine(given, rest), key, index, tile)
-
-    fly = (
-        jax.jit(tile_of)
-        .lower(given, key, jnp.asarray(0))
-        .compile(compiler_options=compiler_options())
-    )
-    compile_s = time.perf_counter() - began
+    rest = jax.tree_util.tree_flatten(rest)
+    fly = _program(jax.default_backend())
+    one = lambda i: jax.device_get(fly(given, key, jnp.asarray(i), tuple(rest[0]), rest[1], tile))
+    one(0)
+    compile_s = time.perf_counter() - began  # the first tile's flight included
 
     began = time.perf_counter()
-    one = lambda i: jax.device_get(fly(given, key, jnp.asarray(i)))
     parts = over_cores(one, tiles, progress)
     elapsed = time.perf_counter() - began
     joined = jax.tree_util.tree_map(lambda *leaves: np.concatenate(leaves)[:cases], *parts)
@@ -159,6 +154,20 @@ def compiler_options() -> dict[str, Any]:
 
 
 _prepare = eqx.filter_jit(shared)
+
+
+@functools.cache
+def _program(backend: str) -> Any:
+    """The compiled flight of one tile; one function, so that a second sweep compiles nothing."""
+    del backend  # in the key of the cache, since it decides the options
+
+    def tile_of(
+        given: Any, key: Array, index: Array, leaves: tuple, treedef: Any, tile: int
+    ) -> dict[str, Any]:
+        rest = jax.tree_util.tree_unflatten(treedef, leaves)
+        return _fly_tile(*eqx.combine(given, rest), key, index, tile)
+
+    return jax.jit(tile_of, static_argnums=(3, 4, 5), compiler_options=compiler_options())
 
 
 def _fly_tile(
