@@ -70,22 +70,6 @@ def cholesky_positive(a: Float[Array, "n n"]) -> Bool[Array, ""]:
     return ok
 
 
-def determinant_sign(a: Float[Array, "n n"]) -> Float[Array, ""]:
-    """Sign of det(a), by elimination with partial pivoting."""
-    n = a.shape[0]
-    sign = jnp.ones((), a.dtype)
-    for k in range(n):
-        column = jnp.where(jnp.arange(n) >= k, jnp.abs(a[:, k]), -1.0)
-        p = jnp.argmax(column)
-        pivot_row, other = a[p], a[k]
-        a = jnp.where((jnp.arange(n) == p)[:, None], other[None, :], a)
-        a = jnp.where((jnp.arange(n) == k)[:, None], pivot_row[None, :], a)
-        sign = sign * jnp.sign(a[k, k]) * jnp.where(p == k, 1.0, -1.0)
-        ratio = a[:, k] / jnp.where(a[k, k] == 0, 1.0, a[k, k])
-        a = a - jnp.where(jnp.arange(n) > k, ratio, 0.0)[:, None] * a[k][None, :]
-    return sign
-
-
 def left_null_space(
     a: Float[Array, "rows cols"],
 ) -> tuple[Float[Array, "null rows"], Float[Array, "cols rows"]]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxguide.linalg import SmallLU, cholesky_positive, determinant_sign, left_null_space, solve
+from jaxguide.linalg import SmallLU, cholesky_positive, left_null_space, solve
 
 EPS = np.finfo(float).eps
 
@@ -94,19 +94,6 @@ def test_cholesky_positive_refuses_zero_pivots_and_nan():
         np.full((2, 2), np.nan),
     ):
         assert not bool(cholesky_positive(jnp.asarray(a)))
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
-def test_determinant_sign(n):
-    a = np.random.default_rng(n).normal(size=(20, n, n))
-    got = jax.vmap(determinant_sign)(jnp.asarray(a))
-    np.testing.assert_array_equal(got, np.sign(np.linalg.det(a)))
-
-
-def test_determinant_sign_of_permutations_and_singular():
-    assert float(determinant_sign(jnp.array([[0.0, 1.0], [1.0, 0.0]]))) == -1
-    assert float(determinant_sign(jnp.eye(3)[jnp.array([1, 2, 0])])) == 1
-    assert float(determinant_sign(jnp.array([[1.0, 2.0], [2.0, 4.0]]))) == 0
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(5, 2), (4, 1), (6, 5), (3, 0)])

@@ -92,7 +92,9 @@ class Mission(eqx.Module):
             )
         dtype = initial_state.dtype
         self.plant = with_array_leaves(plant)
-        self.law = law
+        # Numbers a user wrote become arrays; functions (a sensor, say) stay.
+        to_array = lambda a: jnp.asarray(a) if isinstance(a, (int, float, np.ndarray)) else a
+        self.law = jax.tree_util.tree_map(to_array, law)
         self.initial_state = initial_state
         self.sample_interval = jnp.asarray(sample_interval, dtype)
         self.hold = HoldDeviation() if hold is None else hold

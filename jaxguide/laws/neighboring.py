@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,22 +54,26 @@ class NeighboringOptimal(Law):
 
     def prepared(self, grid: SampleGrid, histories: bool) -> "PreparedNeighboring":
         extremal = self.schedule.extremal
-        # Past the last gain (samples beyond the end of the flight have no length) hold it.
-        times = jnp.minimum(grid.times, self.schedule.times[-1])
-        stages = grid.stages
+        own = lambda a: a.astype(extremal.t.dtype)
+        grid_times, stages = own(grid.times), own(grid.stages)
+        # Samples at the end have no length, and the gain may be infinite there: hold the last.
+        times = jnp.where(grid_times < extremal.t[-1], grid_times, self.schedule.times[-1])
         K = jax.vmap(self.schedule)(times)
         maps = None
         if histories:
             at_stages = jax.vmap(lambda t_k, ts: jax.vmap(lambda t: self._gain(t_k, t))(ts))
             maps = at_stages(times, jnp.maximum(stages, times[:, None]))
-        return PreparedNeighboring(
-            extremal(grid.times).x,
+        stacked = PreparedNeighboring(
+            extremal(grid_times).x,
             self.scale * K,
             jax.vmap(lambda ts: extremal(ts).u)(stages),
             maps,
             jnp.broadcast_to(jnp.asarray(self.cap, K.dtype), (grid.times.shape[0],)),
-            grid.times < extremal.t[-1],
+            grid_times < extremal.t[-1],
         )
+        # Gains are float64; the flight may not be.
+        to_flight = lambda a: a.astype(grid.times.dtype) if eqx.is_inexact_array(a) else a
+        return jax.tree_util.tree_map(to_flight, stacked)
 
 
 class NeighboringCommand(Command):

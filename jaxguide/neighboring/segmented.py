@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.linalg import cholesky_positive, determinant_sign, solve
+from jaxguide.linalg import cholesky_positive, solve
 from jaxguide.neighboring.linearization import (
     Canonical,
     Terminal,
@@ -331,16 +331,43 @@ def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> Gains:
 
 
 def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
-    """Whether det G_lambda changes sign between each time and the end: a conjugate point."""
+    """Whether a conjugate point lies between each time and the end.
+
+    Across a segment dx(l) = Phi_11 (I + N S) dx(r) with N = Phi_11^-1 Phi_12 >= 0 symmetric, of
+    the transition from its end r back to l. Every conjugate point inside turns one eigenvalue of
+    I + N S, all real, negative: counted so (by Cholesky of I + L^T S L, N = L L^T) and not by the
+    sign of a determinant, a pair that falls together is seen too.
+    """
     n = sweep.scale.shape[0] // 2
-    at_breaks, at_times = sweep.ends[:-1], jax.vmap(sweep.rows)(times)
-    rows = jnp.concatenate([at_breaks, at_times])[:, :n, n : 2 * n]
-    signs = jax.vmap(determinant_sign)(rows)
-    inner = sweep.breaks[1:-1]
-    at_breaks, at_times = signs[: inner.shape[0]], signs[inner.shape[0] :]
-    baseline = at_breaks[-1]  # nothing is conjugate within the last segment of a resolved mesh
-    later = inner[None, :] >= times[:, None]
-    return jnp.any(later & (at_breaks != baseline)[None, :], axis=1) | (at_times != baseline)
+    eye = jnp.eye(n, dtype=sweep.scale.dtype)
+
+    def crossed(i: Array, l: Array) -> Array:
+        forward = sweep.transition(i, l)[:, : 2 * n]  # its inverse is [[d^T, -b^T], ...]
+        b, d = forward[:n, n:], forward[n:, n:]
+        G = sweep.ends[i][:n, : 2 * n]
+        S = -solve(G[:, n:], G[:, :n])
+        L = _root(-solve(d.T, b.T))
+        return ~cholesky_positive(eye + L.T @ ((S + S.T) / 2) @ L)
+
+    # Nothing is conjugate within the last segment of a resolved mesh, where S may be infinite.
+    last = sweep.breaks.shape[0] - 2
+    at = jax.vmap(sweep.locate)(times)
+    segments = jnp.arange(last, dtype=at.dtype)
+    whole = jax.vmap(crossed)(segments, sweep.breaks[:-2])
+    own = jax.vmap(crossed)(at, times) & (at < last)
+    return own | jnp.any(whole[None, :] & (segments[None, :] > at[:, None]), axis=1)
+
+
+def _root(N: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """L with L L^T = N for a symmetric semidefinite N: Cholesky that skips empty pivots."""
+    columns = []
+    tiny = jnp.finfo(N.dtype).eps * jnp.max(jnp.abs(N))
+    for k in range(N.shape[0]):
+        pivot = N[k, k]
+        column = jnp.where(pivot > tiny, N[:, k] / jnp.sqrt(jnp.maximum(pivot, tiny)), 0.0)
+        columns.append(column)
+        N = N - jnp.outer(column, column)
+    return jnp.stack(columns, axis=1)
 
 
 def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "two_n n"]:
