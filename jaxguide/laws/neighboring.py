@@ -50,19 +50,19 @@ class NeighboringOptimal(Law):
         ), None
 
     def _gain(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
-        return self.scale * self.schedule.history(t_k, t)
+        """du(t) per dx(t_k); outside the schedule's times its first or last gain is held."""
+        known = jnp.clip(t_k, self.schedule.times[0], self.schedule.times[-1])
+        return self.scale * self.schedule.history(known, jnp.where(known == t_k, t, known))
 
     def prepared(self, grid: SampleGrid, histories: bool) -> "PreparedNeighboring":
         extremal = self.schedule.extremal
         own = lambda a: a.astype(extremal.t.dtype)
         grid_times, stages = own(grid.times), own(grid.stages)
-        # Samples at the end have no length, and the gain may be infinite there: hold the last.
-        times = jnp.where(grid_times < extremal.t[-1], grid_times, self.schedule.times[-1])
-        K = jax.vmap(self.schedule)(times)
+        K = jax.vmap(self.schedule)(grid_times)
         maps = None
         if histories:
             at_stages = jax.vmap(lambda t_k, ts: jax.vmap(lambda t: self._gain(t_k, t))(ts))
-            maps = at_stages(times, jnp.maximum(stages, times[:, None]))
+            maps = at_stages(grid_times, stages)
         stacked = PreparedNeighboring(
             extremal(grid_times).x,
             self.scale * K,

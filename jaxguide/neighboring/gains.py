@@ -52,7 +52,7 @@ class GainSchedule(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, t: Any) -> Float[Array, "m n"]:
-        """K at `t`; a collocated schedule holds it outside `[times[0], times[-1]]`."""
+        """K at `t`, held outside `[times[0], times[-1]]`."""
 
     @abc.abstractmethod
     def history(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
@@ -60,7 +60,7 @@ class GainSchedule(eqx.Module):
 
 
 class SegmentedSchedule(GainSchedule):
-    """From the backward sweep: exact at any time of the horizon, not only between `times`."""
+    """From the backward sweep: exact between `times` too."""
 
     times: Float[Array, " time"]
     K: Float[Array, "time m n"]
@@ -75,7 +75,7 @@ class SegmentedSchedule(GainSchedule):
     sweep: Sweep
 
     def __call__(self, t: Any) -> Float[Array, "m n"]:
-        t = jnp.asarray(t, self.times.dtype)
+        t = jnp.clip(jnp.asarray(t, self.times.dtype), self.times[0], self.times[-1])
         c, _ = canonical_at(self.extremal.problem, t, self.extremal(t), ())
         return gains_at(self.sweep, c, t, False).K[:, : self._n]
 
