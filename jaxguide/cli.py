@@ -6,6 +6,7 @@ Each command returns an `Outcome`; `main` alone prints, reports errors and sets 
 
 import contextlib
 import dataclasses
+import gc
 import json
 import os
 import sys
@@ -97,6 +98,7 @@ def configure() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # cache hits on CPU are noisy
     # A computation that holds an `eqx.error_if` is a host callback, which is never cached. The
     # library reports failures as values, so none is needed.
+    gc.set_threshold(200_000, 20, 20)  # tracing makes objects by the million, few of them garbage
     os.environ.setdefault("EQX_ON_ERROR", "nan")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else idle pools spin beside XLA
     import jax
@@ -404,10 +406,9 @@ def _folder(out: Path | None) -> Path | None:
 
 
 def _save(figure: Any, out: Path, stem: str) -> str:
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / f"{stem}.png"
-    figure.savefig(path, dpi=200)
-    return str(path)
+    from jaxguide.plotting import save
+
+    return save(figure, out / f"{stem}.png")
 
 
 def _written(figures: list[str]) -> list[Text]:

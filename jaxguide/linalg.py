@@ -30,6 +30,7 @@ def _eliminate(k: Any, ab: Array) -> Array:
     return jnp.where((rows == k)[:, None], pivot_row[None, :], ab)
 
 
+@jax.jit
 def _gauss(a: Array, b: Array) -> Array:
     n = a.shape[0]
     ab = jnp.concatenate([a, b], axis=1)
@@ -41,6 +42,7 @@ def _gauss(a: Array, b: Array) -> Array:
     return ab[:, n:]
 
 
+@jax.jit
 def solve(a: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """`a^-1 b` by Gauss-Jordan elimination with partial pivoting.
 
@@ -61,6 +63,7 @@ def solve(a: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k
     return out if b.ndim == 2 else out[:, 0]
 
 
+@jax.jit
 def cholesky_positive(a: Float[Array, "n n"]) -> Bool[Array, ""]:
     """Whether the symmetric `a` is positive definite, by the signs of its elimination pivots."""
     ok = jnp.array(True)

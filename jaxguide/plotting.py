@@ -1,13 +1,14 @@
 """Figures of extremals, gains, flights and sweeps. Host only; no pyplot, so no display is needed.
 
-Each function returns a `matplotlib.figure.Figure`; `figure.savefig(path, dpi=200)` writes it. Every
-line has its own dash pattern as well as its own colour, so that figures survive a black and white
-printer. `units` maps names of states and controls, and "t", to units shown on the axes.
+Each `plot_` function returns a `matplotlib.figure.Figure`; `save` writes it. Every line has its own
+dash pattern as well as its own colour, so that figures survive a black and white printer. `units`
+maps names of states and controls, and "t", to units shown on the axes.
 """
 
 import functools as ft
 import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -44,7 +45,6 @@ STYLE: dict[Any, Any] = {
     "legend.handlelength": 2.8,
     "lines.linewidth": 1.2,
     "lines.markersize": 4.0,
-    "axes.formatter.use_mathtext": True,
     "axes.formatter.limits": (-3, 4),
     "figure.constrained_layout.use": True,
 }
@@ -60,6 +60,21 @@ def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
             return draw(*args, **options)
 
     return call
+
+
+def save(figure: Figure, path: Path, dpi: float = 200.0) -> str:
+    """Writes `figure`, makes folders as needed, and returns the path.
+
+    `savefig` alone would draw it twice, the first time to lay it out.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.set_dpi(dpi)
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+    figure.savefig(path, dpi=dpi)
+    return str(path)
 
 
 def line(i: int) -> dict[str, Any]:
@@ -187,69 +202,81 @@ def plot_flight(flight: Any, extremal: Any, units: Units = None) -> Figure:
 def plot_deviations(
     flights: Any,
     extremal: Any,
-    name: str,
+    names: str | Sequence[str],
     labels: Sequence[str] | None = None,
     units: Units = None,
 ) -> Figure:
-    """Deviation of one state, or of one control, from the nominal (2002 paper, figures 3 to 6).
+    """Deviations from the nominal of several flights (2002 paper, figures 3 to 6).
 
-    **Arguments:** `flights`: a Flight whose arrays have a leading case axis; `name`: of a state or
-    a control; `labels`: of the cases.
-
-    **Raises:** `ValueError` for a name that is neither.
+    **Arguments:** `flights`: a Flight with a leading case axis; `names`: of states (their
+    deviation) or controls (the commanded feedback), a panel each; `labels`: one a case.
     """
     states, controls = _names(extremal.problem)
     t = np.asarray(flights.t)[0]
-    if name in states:
-        i = states.index(name)
-        values = np.asarray(flights.x)[:, :, i] - at(extremal, t)[0][None, :, i]
-    elif name in controls:
-        t = t[:-1]
-        values = np.asarray(flights.commands)[:, :, controls.index(name)]
-    else:
-        raise ValueError(f"{name!r} is no state {states} and no control {controls}.")
-    return _cases(t, values, label(name, units, r"\delta "), labels, units)
+    dx = np.asarray(flights.x) - at(extremal, t)[0][None]
+    panels = []
+    for name in _tuple(names):
+        if name in states:
+            values, when = dx[:, :, states.index(name)], t
+        elif name in controls:
+            values, when = np.asarray(flights.commands)[:, :, controls.index(name)], t[:-1]
+        else:
+            raise ValueError(f"{name!r} is no state {states} and no control {controls}.")
+        panels.append((when, values, label(name, units, r"\delta ")))
+    return _cases(panels, labels, units)
 
 
 @styled
 def plot_reoptimised(
     flights: Any,
     reoptimised: np.ndarray,
-    name: str,
+    names: str | Sequence[str],
     state_names: Sequence[str],
     labels: Sequence[str] | None = None,
     units: Units = None,
 ) -> Figure:
-    """Flown minus re-optimised state (2002 paper, figures 7 to 9).
+    """Flown minus re-optimised states (2002 paper, figures 7 to 9).
 
     **Arguments:** `flights`: a Flight with a leading case axis; `reoptimised` (case, sample+1, n):
-    states, at the same times, of the extremals from the perturbed starts; `name`: of a state.
+    states, at the same times, of the extremals from the perturbed starts; `names`: of states, a
+    panel each.
     """
     states = tuple(state_names)
-    if name not in states:
-        raise ValueError(f"{name!r} is no state; there are {states}.")
-    i = states.index(name)
-    values = np.asarray(flights.x)[:, :, i] - np.asarray(reoptimised)[:, :, i]
-    quantity = f"{symbol(name)} minus re-optimised"
-    unit = (units or {}).get(name, "")
-    text = f"{quantity} [{unit}]" if unit else quantity
-    return _cases(np.asarray(flights.t)[0], values, text, labels, units)
+    off = np.asarray(flights.x) - np.asarray(reoptimised)
+    panels = []
+    for name in _tuple(names):
+        if name not in states:
+            raise ValueError(f"{name!r} is no state; there are {states}.")
+        unit = (units or {}).get(name, "")
+        text = f"{symbol(name)} minus re-optimised" + (f" [{unit}]" if unit else "")
+        panels.append((np.asarray(flights.t)[0], off[:, :, states.index(name)], text))
+    return _cases(panels, labels, units)
+
+
+def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 def _cases(
-    t: np.ndarray, values: np.ndarray, text: str, labels: Sequence[str] | None, units: Units
+    panels: Sequence[tuple[np.ndarray, np.ndarray, str]],
+    labels: Sequence[str] | None,
+    units: Units,
 ) -> Figure:
-    labels = [f"case {k + 1}" for k in range(len(values))] if labels is None else labels
-    figure, axes = _grid(1, 1, 3.4)
-    axis = axes[0, 0]
-    axis.axhline(0.0, color="#808080", linewidth=0.6)
-    for k, (row, text_k) in enumerate(zip(values, labels, strict=True)):
-        axis.plot(t, row, label=text_k, **line(k))
-    axis.set_xlim(t[0], t[-1])
-    axis.set_xlabel(label("t", units))
-    axis.set_ylabel(text)
+    """A panel for each (times, values by case, text), all with the same cases."""
+    cases = len(panels[0][1])
+    labels = [f"case {k + 1}" for k in range(cases)] if labels is None else labels
+    figure, axes = _grid(len(panels), 1, 3.4 if len(panels) == 1 else 2.2, sharex=True)
+    for axis, (t, values, text) in zip(axes[:, 0], panels, strict=True):
+        axis.axhline(0.0, color="#808080", linewidth=0.6)
+        for k, (row, text_k) in enumerate(zip(values, labels, strict=True)):
+            axis.plot(t, row, label=text_k, **line(k))
+        axis.set_xlim(t[0], t[-1])
+        axis.set_ylabel(text)
+    _time_axis(axes, units)
     # Six curves leave no free corner, so the legend stands above.
-    figure.legend(loc="outside upper center", ncols=2 if len(labels) > 3 else 1)
+    handles = axes[0, 0].get_legend_handles_labels()
+    columns = 2 if len(labels) > 3 else 1
+    figure.legend(*handles, loc="outside upper center", ncols=columns)
     return figure
 
 

@@ -134,6 +134,7 @@ def with_array_leaves(problem: Problem) -> Problem:
     return jax.tree_util.tree_map(jnp.asarray, problem)
 
 
+@jax.jit
 def hamiltonian(
     problem: Problem, t: Any, x: Float[Array, " n"], u: Float[Array, " m"], costate: Array
 ) -> Float[Array, ""]:

@@ -102,11 +102,7 @@ class Extremal(Trajectory):
         (one Newton step from its interpolant, so an angle stays unwrapped).
         """
         t = jnp.asarray(t, self.t.dtype)
-        if t.ndim == 1:
-            return jax.vmap(self.__call__)(t)
-        x, u, costate = self.point(t)
-        t = jnp.clip(t, self.t[0], self.t[-1])
-        return Point(x, polish_control(self.problem, t, x, u, costate), costate)
+        return jax.vmap(_polished, in_axes=(None, 0))(self, t) if t.ndim else _polished(self, t)
 
     def point(self, t: Any) -> Point:
         """The interpolant at the scalar `t`, its control as interpolated."""
@@ -115,6 +111,14 @@ class Extremal(Trajectory):
         return Point(y[:n], y[n : n + m], y[n + m :])
 
 
+@jax.jit
+def _polished(extremal: Extremal, t: Array) -> Point:
+    x, u, costate = extremal.point(t)
+    t = jnp.clip(t, extremal.t[0], extremal.t[-1])
+    return Point(x, polish_control(extremal.problem, t, x, u, costate), costate)
+
+
+@jax.jit
 def polish_control(
     problem: Problem, t: Any, x: Array, u: Array, costate: Array
 ) -> Float[Array, " m"]:

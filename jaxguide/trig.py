@@ -70,6 +70,7 @@ def _horner(coefficients, z):
 
 
 @jax.custom_jvp
+@jax.jit
 def _sincos(x):
     kind = x.dtype.name
     # One select covers every failure: nan stays, inf and the unreducible become nan.

@@ -17,7 +17,7 @@ from conftest import DoubleIntegrator, FreeTime, at
 import jaxguide as jg
 from jaxguide.montecarlo.sweep import cast
 from jaxguide.problems.earth_mars import EarthMars
-from jaxguide.reproduce.earth_mars import CASES, FINAL_ERRORS, REOPTIMISED
+from jaxguide.reproduce.earth_mars.published import CASES, FINAL_ERRORS, REOPTIMISED
 
 START = (0.1, -0.1)
 simulate = eqx.filter_jit(jg.simulate)

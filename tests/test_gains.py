@@ -17,7 +17,8 @@ from scipy.integrate import solve_ivp
 import jaxguide as jg
 from jaxguide.neighboring import gains as gains_module
 from jaxguide.problems.earth_mars import EarthMars
-from jaxguide.reproduce.earth_mars import GAINS_EXACT, GAINS_LEAST_SQUARES, GAINS_SQUARE, relative
+from jaxguide.reproduce.earth_mars.collocation import relative
+from jaxguide.reproduce.earth_mars.published import GAINS_EXACT, GAINS_LEAST_SQUARES, GAINS_SQUARE
 
 PAPER_TIMES = np.asarray(list(GAINS_EXACT))
 # End conditions of the reference file: eq. (15) with H maximised, so the costate's sign changes.

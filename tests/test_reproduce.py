@@ -11,10 +11,11 @@ from matplotlib.figure import Figure
 
 from jaxguide import plotting, reproduce
 from jaxguide.problems.earth_mars import EarthMars
-from jaxguide.reproduce import earth_mars
+from jaxguide.reproduce.earth_mars import collocation
+from jaxguide.reproduce.earth_mars import flights as cases
+from jaxguide.reproduce.earth_mars.published import STATES, UNITS
 from jaxguide.spectral import differentiation_matrix, interpolate, nodes_lgl
 
-UNITS = earth_mars.UNITS
 SEGMENTS, P = 3, 5
 
 
@@ -46,9 +47,11 @@ def test_paper(tmp_path):
     assert progress.closed == 1
     assert progress.seen == sorted(progress.seen) and progress.seen[-1] == pytest.approx(1.0)
     names = {path.name for path in tmp_path.glob("*.png")}
-    assert len(names) == len(report.figures) == 12
-    for figure in range(2, 10):
-        assert any(f"fig{figure}-" in name for name in names)
+    assert len(names) == len(report.figures) == 8
+    assert [name for name in sorted(names) if "fig" in name] == [
+        f"earth-mars-{figure}.png"
+        for figure in ("fig2-nominal", "fig3-feedback", "fig4-to-6-states", "fig7-to-9-reoptimised")
+    ]
     wrong = next(s for s in report.sections if "wrong" in s.title)
     assert wrong.rows[-1].computed >= 7  # most of the printed r and v_t, of 12
 
@@ -108,9 +111,10 @@ FIGURES = {
         types.SimpleNamespace(**{k: v[0] for k, v in vars(flights(1)).items()}), extremal(), UNITS
     ),
     "state deviations": lambda rng: plotting.plot_deviations(flights(6), extremal(), "v_t"),
+    "deviations of all": lambda rng: plotting.plot_deviations(flights(6), extremal(), STATES),
     "control deviations": lambda rng: plotting.plot_deviations(flights(2), extremal(), "epsilon"),
     "re-optimised": lambda rng: plotting.plot_reoptimised(
-        flights(6), flights(6).x * 0.9, "r", earth_mars.STATES, units=UNITS
+        flights(6), flights(6).x * 0.9, "r", STATES, units=UNITS
     ),
     "gain errors": lambda rng: plotting.plot_gain_errors(
         {"K(0)": {"a": ([9, 17], [1e-2, 1e-5])}, "K(2)": {"a": ([9, 17], [1e-3, 0.0])}}
@@ -161,7 +165,7 @@ def test_host_interpolation_is_exact_for_the_mesh_degree():
 @pytest.mark.parametrize("N", [2, 9, 64])
 def test_host_differentiation_matrix_is_the_library_s(N):
     library = differentiation_matrix(jnp.asarray(nodes_lgl(N + 1)[0]))
-    np.testing.assert_allclose(earth_mars.differentiation(N), library, atol=1e-12 * N**2)
+    np.testing.assert_allclose(collocation.differentiation(N), library, atol=1e-12 * N**2)
 
 
 def test_host_collocation_of_the_double_integrator():
@@ -171,9 +175,9 @@ def test_host_collocation_of_the_double_integrator():
     psi = np.concatenate([np.eye(2), np.zeros((2, 2))], axis=1)
     U = np.array([[0.0, 0.0, 0.0, -1.0]])
     t = nodes_lgl(9)[0] + 1
-    system = earth_mars.System(np.tile(M, (9, 1, 1)), np.tile(U, (9, 1, 1)), psi)
+    system = collocation.System(np.tile(M, (9, 1, 1)), np.tile(U, (9, 1, 1)), psi)
     for square in (False, True):
-        K = U @ earth_mars.horizon(t, system, square)[0]
+        K = U @ collocation.horizon(t, system, square)[0]
         np.testing.assert_allclose(K, [[-1.5, -2.0]], atol=1e-12)
 
 
@@ -182,11 +186,11 @@ def test_tabulated_law_looks_up_and_holds():
     nodes = jnp.asarray(nodes_lgl(6)[0])
     t = jnp.stack([0.5 * (nodes + 1) / 2, 0.5 + 0.5 * (nodes + 1) / 2])
     maps = jnp.stack([t**3, t, -t], axis=2)[:, :, None, :]
-    table = earth_mars.Table(jnp.zeros((2, 3)), (t**2)[:, :, None], maps)
-    law = earth_mars.Tabulated(table, nodes, jnp.asarray(0.5))
+    table = cases.Table(jnp.zeros((2, 3)), (t**2)[:, :, None], maps)
+    law = cases.Tabulated(table, nodes, jnp.asarray(0.5))
     command, _ = law(jnp.asarray(0.5), jnp.asarray([2.0, 1.0, 0.0]), None)
     for kind, at_nominal, at_deviation in ((0, 0.7, 0.7), (1, 0.7, 0.5), (2, 0.5, 0.5)):
-        flown = earth_mars.Clocked(jnp.asarray(kind))(command, jnp.asarray(0.5))
+        flown = cases.Clocked(jnp.asarray(kind))(command, jnp.asarray(0.5))
         nominal, deviation = flown.nominal(jnp.asarray(0.7)), flown.deviation(jnp.asarray(0.7))
         np.testing.assert_allclose(nominal, [at_nominal**2], atol=1e-14)
         np.testing.assert_allclose(deviation, [2 * at_deviation**3 + at_deviation], atol=1e-14)
@@ -194,7 +198,7 @@ def test_tabulated_law_looks_up_and_holds():
 
 def test_table_resolves_the_sharpest_turn():
     """Twelve points on a sample: a pole 0.05 TU off the axis leaves 1e-11 at worst."""
-    nodes = jnp.asarray(nodes_lgl(earth_mars.TABLE_NODES)[0])
+    nodes = jnp.asarray(nodes_lgl(cases.TABLE_NODES)[0])
     turn = lambda t: jnp.arctan((t - 1.69) / 0.05)
     middle = 1.69 + 0.005
     values = turn(middle + 0.01 * nodes)[:, None]

@@ -18,10 +18,10 @@ from scipy import integrate, optimize
 import jaxguide as jg
 from jaxguide.nominal.shooting import _judge
 from jaxguide.problems.earth_mars import EarthMars
-from jaxguide.reproduce.earth_mars import ANGLES, COSTATE_END, COSTATE_START, RADIUS
+from jaxguide.reproduce.earth_mars.published import ANGLES, COSTATE_END, COSTATE_START, RADIUS
 
 # Earth-Mars at two times that are no nodes, with the sign of a minimised H; computed without this
-# package (see jaxguide/reproduce/earth_mars.py, whose numbers have the same source).
+# package (see jaxguide/reproduce/earth_mars/published.py, whose numbers have the same source).
 BETWEEN = {
     1.0: (
         (1.07567529135545057, 0.18654754702150509, 1.03225292131381051),

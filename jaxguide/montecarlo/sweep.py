@@ -69,7 +69,8 @@ def sweep(
         raise ValueError(f"sweep: tile is {tile}; give at least 1.")
     if dtype is not None:
         mission = cast(mission, dtype)
-    draw(mission, dispersions, jax.random.key(0))  # refuses bad paths and shapes at once
+    check = lambda: draw(mission, dispersions, jax.random.key(0))
+    jax.eval_shape(check)  # refuses bad paths and shapes at once
 
     tiles = -(-cases // tile)
     key = jax.random.key(seed)
@@ -92,7 +93,7 @@ def sweep(
     states = mission.plant.state_names
     reasons, counts = np.unique(joined["code"][~good], return_counts=True)
     failures = {_message(int(code)): int(k) for code, k in zip(reasons, counts, strict=True)}
-    centre, covariance = linear_covariance(mission, dispersions)
+    centre, covariance = linear_covariance(mission, dispersions, prepared)
     finals = joined["final_state"][good]
     attrs = {
         "cases": cases,
@@ -165,7 +166,8 @@ def _program(backend: str) -> Any:
         given: Any, key: Array, index: Array, leaves: tuple, treedef: Any, tile: int
     ) -> dict[str, Any]:
         rest = jax.tree_util.tree_unflatten(treedef, leaves)
-        return _fly_tile(*eqx.combine(given, rest), key, index, tile)
+        mission, dispersions, prepared = eqx.combine(given, rest)
+        return _fly_tile(mission, dispersions, prepared, key, index, tile)
 
     return jax.jit(tile_of, static_argnums=(3, 4, 5), compiler_options=compiler_options())
 

@@ -1,5 +1,7 @@
 """The paper's Legendre pseudospectral gain map on each remaining horizon: eqs (22)-(49)."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,54 +43,45 @@ def _square_rows(points: int, n: int) -> np.ndarray:
     return rows[~(state_first | costate_last)]
 
 
+class Horizons(NamedTuple):
+    """Deviations on the horizon from each time, at its LGL points, per deviation at its start."""
+
+    nodes: Float[Array, " node"]  # of [-1, 1]
+    states: Float[Array, "time node n n"]  # W1 of eq. (46), the identity of x_0 on top
+    controls: Float[Array, "time node m n"]  # eq. (49)
+
+
 def solve_horizons(
     extremal: Extremal, times: Float[Array, " time"], nodes: int, square: bool
-) -> Float[Array, "time unknown n"]:
-    """Z per x_0 (eq. 45, with the identity of x_0 itself on top) for the horizon from each time.
+) -> Horizons:
+    """W of eq. (45), and with it the histories of state and control, for the horizon of each time.
 
     Least squares by QR, one horizon at a time: LAPACK under `vmap` may hang, and the matrices are
-    large enough to fill the machine. Nothing is truncated (no `rcond`).
+    large enough to fill the machine. R of [Ve V0] holds all that is needed: Q is never formed.
+    Nothing is truncated (no `rcond`).
     """
     problem, n = extremal.problem, extremal.problem.n
-    tau_host, _ = nodes_lgl(nodes)
-    tau = jnp.asarray(tau_host, times.dtype)
+    tau = jnp.asarray(nodes_lgl(nodes)[0], times.dtype)
     D = differentiation_matrix(tau)
     psi = terminal_conditions(extremal).psi
     keep = _square_rows(nodes, n) if square else None
 
-    def one(t0: Array) -> Array:
+    def one(t0: Array) -> tuple[Array, Array]:
         half = (extremal.t[-1] - t0) / 2
         t = t0 + half * (tau + 1)  # eq. (22)
         point = extremal(t)
         v = jax.vmap(lambda t, x, u, c: second_variation(problem, t, x, u, c))(t, *point)
-        V = assemble(D, half, jax.vmap(canonical)(v).M, psi)
+        c = jax.vmap(canonical)(v)
+        V = assemble(D, half, c.M, psi)
         V = V if keep is None else V[keep]
         V0, Ve = V[:, :n], V[:, n:]  # eq. (43)
         if keep is None:
-            q, r = jnp.linalg.qr(Ve)
-            W = -jax.scipy.linalg.solve_triangular(r, q.T @ V0)  # eq. (45)
+            R = jnp.linalg.qr(jnp.concatenate([Ve, V0], axis=1), mode="r")
+            W = -jax.scipy.linalg.solve_triangular(R[:-n, :-n], R[:-n, -n:])  # eq. (45)
         else:
             W = -jnp.linalg.solve(Ve, V0)
-        return jnp.concatenate([jnp.eye(n, dtype=W.dtype), W])
+        W = jnp.concatenate([jnp.eye(n, dtype=W.dtype), W])
+        W1, W2 = W.reshape(2, nodes, n, n)  # eqs (46), (47)
+        return W1, c.U[..., :n] @ W1 + c.U[..., n:] @ W2
 
-    return jax.lax.map(one, times)
-
-
-def history_maps(
-    extremal: Extremal, times: Float[Array, " time"], Z: Float[Array, "time unknown n"], nodes: int
-) -> tuple[Array, Array, Array]:
-    """LGL points, W1 (eq. 46) and the control per initial deviation at them (eq. 49)."""
-    problem, n = extremal.problem, extremal.problem.n
-    tau = jnp.asarray(nodes_lgl(nodes)[0], times.dtype)
-    W1 = Z[:, : n * nodes].reshape(times.shape[0], nodes, n, n)
-    W2 = Z[:, n * nodes :].reshape(times.shape[0], nodes, n, n)
-
-    def rows(t0: Array) -> Array:
-        t = t0 + (extremal.t[-1] - t0) / 2 * (tau + 1)
-        point = extremal(t)
-        v = jax.vmap(lambda t, x, u, c: second_variation(problem, t, x, u, c))(t, *point)
-        return jax.vmap(canonical)(v).U
-
-    U = jax.vmap(rows)(times)
-    controls = U[..., :n] @ W1 + U[..., n:] @ W2
-    return tau, W1, controls
+    return Horizons(tau, *jax.lax.map(one, times))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve
-from jaxguide.neighboring.collocated import history_maps, solve_horizons
+from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import (
     Sweep,
@@ -258,9 +258,8 @@ def _collocated(
     exact: SegmentedSchedule, method: str, nodes: int, tolerance: float
 ) -> CollocatedSchedule:
     extremal, times = exact.extremal, exact.times
-    W = solve_horizons(extremal, times, nodes, method == "square")
-    tau, state_maps, control_maps = history_maps(extremal, times, W, nodes)
-    K = control_maps[:, 0]
+    horizons = solve_horizons(extremal, times, nodes, method == "square")
+    K = horizons.controls[:, 0]
     size = jnp.max(jnp.abs(exact.K), axis=(1, 2))
     error = jnp.max(jnp.abs(K - exact.K), axis=(1, 2)) / jnp.where(size > 0, size, 1.0)
     error = jnp.where(jnp.isfinite(error), error, jnp.inf) + exact.error
@@ -281,7 +280,7 @@ def _collocated(
         K_target=exact.K_target,
         dtf_dx=exact.dtf_dx,
         extremal=extremal,
-        reference_nodes=tau,
-        state_maps=state_maps,
-        control_maps=control_maps,
+        reference_nodes=horizons.nodes,
+        state_maps=horizons.states,
+        control_maps=horizons.controls,
     )

@@ -1,6 +1,7 @@
 """The linear two-point boundary-value problem about an extremal, eqs (11)-(21), by autodiff."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,7 +40,7 @@ def parameter_values(problem: Problem, names: tuple[str, ...], dtype: Any) -> Fl
     """
     known = [f.name for f in dataclasses.fields(problem)]
     for name in names:
-        value = getattr(problem, name, None)
+        value: Any = getattr(problem, name, None)
         if name not in known or isinstance(value, (tuple, list, str)) or jnp.shape(value) != ():
             raise ValueError(
                 f"{name!r} is not a scalar parameter of {type(problem).__name__}; fields: {known}."
@@ -47,6 +48,7 @@ def parameter_values(problem: Problem, names: tuple[str, ...], dtype: Any) -> Fl
     return jnp.asarray([getattr(problem, name) for name in names], dtype).reshape(len(names))
 
 
+@functools.partial(jax.jit, static_argnames="parameters")
 def second_variation(
     problem: Problem,
     t: Any,
@@ -92,6 +94,7 @@ class Canonical(NamedTuple):
     U_p: Float[Array, "m p"]
 
 
+@jax.jit
 def canonical(v: SecondVariation) -> Canonical:
     """Eliminates du by eq. (16). A singular H_uu gives non-finite entries, which callers flag."""
     rows = jnp.concatenate([v.H_xu.T, v.f_u.T, v.H_up], axis=1)
@@ -123,6 +126,7 @@ class Terminal(NamedTuple):
     time: Float[Array, "deviation"]
 
 
+@functools.partial(jax.jit, static_argnames="parameters")
 def terminal_conditions(extremal: Extremal, parameters: tuple[str, ...] = ()) -> Terminal:
     r"""Eq. (15) for any endpoint constraint, $\nu$ (and $d t_f$) eliminated automatically.
 

@@ -9,6 +9,7 @@ integral form (which superconverges) by Picard sweeps, all segments at once, the
 Arrays run (node, row, column, segment): the batch is last, so that small products vectorise.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -72,6 +73,7 @@ def _identity(shape: tuple[int, ...], dtype: Any) -> Array:
     return jnp.eye(shape[0], shape[1], dtype=dtype)
 
 
+@functools.partial(jax.jit, static_argnames="parameters")
 def canonical_at(
     problem: Problem, t: Array, point: Point, parameters: tuple[str, ...]
 ) -> tuple[Canonical, Array]:
@@ -297,6 +299,7 @@ class Gains(NamedTuple):
     rounding: Float[Array, ""]
 
 
+@functools.partial(jax.jit, static_argnames="free_time")
 def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> Gains:
     """S = -G_lambda^-1 [G_x G_p G_target] and K = U_x + U_lambda S at `t`, unscaled."""
     two_n = sweep.scale.shape[0]
@@ -370,6 +373,7 @@ def _root(N: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.stack(columns, axis=1)
 
 
+@jax.jit
 def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "two_n n"]:
     """(dx, dlambda) at `t_to` per dx(t_from) on neighbouring extremals, segment by segment.
 

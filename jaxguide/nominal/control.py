@@ -13,6 +13,7 @@ _MAX_STEPS = 40
 _STEPS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.003)  # step lengths tried; H_u = 0 is low-dimensional
 
 
+@jax.jit
 def minimising_control(
     problem: Problem, t: Any, x: Float[Array, " n"], costate: Float[Array, " n"]
 ) -> Float[Array, " m"]:

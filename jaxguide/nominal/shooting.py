@@ -26,20 +26,23 @@ from jaxguide.spectral import nodes_lgl
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS, is_traced
 
+_COARSE_ITERATIONS, _COARSE_TOLERANCE = 60, 1e-7
+
 
 class Shooting(eqx.Module):
     """Single (`arcs=1`) or multiple indirect shooting.
 
-    Three stages, each in fixed shapes: without a guess, `starts` random flights are shot at once
-    with coarse steps and the best converged one kept; adaptive integration (Diffrax, Dopri8 at
-    `tolerance`) with Newton (Optimistix); and a last Newton on the mesh that the adaptive steps
-    suggest, through which derivatives are implicit, forward and reverse.
+    Three stages, each in fixed shapes: damped Newton with coarse steps, from the guess or from
+    `starts` random flights at once, the best converged one kept; an adaptive flight of it
+    (Diffrax's Dopri8 at `tolerance`), whose steps lay the mesh; and Newton (Optimistix) with
+    Dopri8 steps on that mesh, through which derivatives are implicit, forward and reverse.
 
     **Arguments:**
 
     - `arcs`: shooting arcs; 1 is single shooting. More arcs tolerate unstable dynamics.
     - `segments`, `degree`: the mesh of the returned Extremal (`segments` a multiple of `arcs`).
-    - `tolerance`: relative and absolute, of the integration.
+    - `tolerance`: relative and absolute, of the integration that lays the mesh.
+    - `coarse_steps`: of the first stage, over the horizon.
     - `starts`, `seed`: how many random starts when no guess is given.
 
     **Error:** boundary conditions to about 1e-12 of their scale; the Certificate tells.
@@ -50,7 +53,7 @@ class Shooting(eqx.Module):
     degree: int = eqx.field(static=True, default=12)
     tolerance: float = eqx.field(static=True, default=1e-13)
     starts: int = eqx.field(static=True, default=32)
-    coarse_steps: int = eqx.field(static=True, default=24)
+    coarse_steps: int = eqx.field(static=True, default=96)
     seed: int = eqx.field(static=True, default=0)
     max_steps: int = eqx.field(static=True, default=1024)
 
@@ -109,33 +112,41 @@ class Shooting(eqx.Module):
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal, without host checks; `solve` wraps this. Pure."""
         dtype = jnp.result_type(float)
-        if guess is None:
-            z = jax.lax.stop_gradient(self._multistart(jax.lax.stop_gradient(problem), dtype))
-        elif isinstance(guess, Unknowns):
-            z = guess
-        else:
-            z = jax.lax.stop_gradient(
-                self._from_guess(jax.lax.stop_gradient(problem), guess, dtype)
-            )
         frozen = jax.lax.stop_gradient(problem)
-        z, fractions = jax.lax.stop_gradient(self._adaptive(frozen, z))
+        if guess is None:
+            z = jax.lax.stop_gradient(self._multistart(frozen, dtype))
+        else:
+            z = jax.lax.stop_gradient(self._from_guess(frozen, guess, dtype))
+        z, fractions = jax.lax.stop_gradient(self._lay_mesh(frozen, z))
         return self._on_mesh(problem, z, fractions, certifier)
+
+    @property
+    def _arc_steps(self) -> int:
+        return -(-self.coarse_steps // self.arcs)
 
     def _multistart(self, problem: Problem, dtype: Any) -> Unknowns:
         keys = jax.random.split(jax.random.key(self.seed), self.starts)
 
         def attempt(key: Array) -> tuple[Unknowns, Array, Array]:
-            z = random_start(problem, key, self.arcs, self.coarse_steps, dtype)
-            return damped_newton(problem, z, self.coarse_steps, 60)
+            z = random_start(problem, key, self.arcs, self._arc_steps, dtype)
+            return damped_newton(problem, z, self._arc_steps, _COARSE_ITERATIONS)
 
         zs, norms, costs = jax.vmap(attempt)(keys)
         norms = jnp.where(jnp.isfinite(norms), norms, jnp.inf)
-        converged = (norms < 1e-7) & jnp.isfinite(costs)
+        converged = (norms < _COARSE_TOLERANCE) & jnp.isfinite(costs)
         by_cost = jnp.argmin(jnp.where(converged, costs, jnp.inf))
         best = jnp.where(jnp.any(converged), by_cost, jnp.argmin(norms))
         return jax.tree_util.tree_map(lambda a: a[best], zs)
 
     def _from_guess(self, problem: Problem, guess: Any, dtype: Any) -> Unknowns:
+        """`guess` as unknowns, improved by the coarse Newton where that converges."""
+        z = guess if isinstance(guess, Unknowns) else self._unknowns(problem, guess, dtype)
+        better, norm, _ = damped_newton(problem, z, self._arc_steps, _COARSE_ITERATIONS)
+        return jax.tree_util.tree_map(
+            lambda a, b: jnp.where(norm < _COARSE_TOLERANCE, a, b), better, z
+        )
+
+    def _unknowns(self, problem: Problem, guess: Any, dtype: Any) -> Unknowns:
         none = jnp.zeros((0,), dtype)
         pick = lambda spec, value: jnp.asarray(value, dtype)[None] if is_free(spec) else none
         if isinstance(guess, Extremal):
@@ -164,7 +175,7 @@ class Shooting(eqx.Module):
         ends = []
         for k in range(self.arcs):
             part = self._arc_window(problem, z, k)
-            end = coarse_ends(part, z, self.coarse_steps)[0, : 2 * problem.n]
+            end = coarse_ends(part, z, self._arc_steps)[0, : 2 * problem.n]
             ends.append(z.starts[0])
             z = z._replace(starts=end[None])
         n = problem.n
@@ -180,43 +191,31 @@ class Shooting(eqx.Module):
         where = lambda p: (p.initial_time, p.final_time)
         return eqx.tree_at(where, problem, (a, b), is_leaf=lambda v: v is None or is_free(v))
 
-    def _adaptive(self, problem: Problem, z: Unknowns) -> tuple[Unknowns, Array]:
-        """Newton with adaptive integration; also where the mesh's segments should break."""
-        fractions = jnp.linspace(0.0, 1.0, self.arcs + 1, dtype=z.starts.dtype)
-
-        def fly(z: Unknowns, problem: Problem) -> diffrax.Solution:
-            t0, tf = horizon(problem, z)
-            times = t0 + (tf - t0) * fractions
-            y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
-            solve_arc = lambda y, a, b: diffrax.diffeqsolve(
-                diffrax.ODETerm(lambda t, y, args: canonical_rates(args, t, y)),
-                diffrax.Dopri8(),
-                a,
-                b,
-                None,
-                y,
-                args=problem,
-                saveat=diffrax.SaveAt(steps=True),
-                stepsize_controller=diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance),
-                max_steps=self.max_steps,
-                adjoint=diffrax.ForwardMode(),
-                throw=False,
-            )
-            return jax.vmap(solve_arc)(y, times[:-1], times[1:])
-
-        def residual(z: Unknowns, problem: Problem) -> tuple[Array, Any]:
-            solution = fly(z, problem)
-            assert solution.ts is not None and solution.ys is not None
-            taken = jnp.isfinite(solution.ts)  # inf beyond the last step
-            last = jnp.sum(taken, axis=1) - 1
-            ends = jax.vmap(lambda ys, i: ys[i])(solution.ys, last)
-            return boundary_residual(problem, z, ends), (solution.ts, solution.ys)
-
-        better, (ts, ys) = _newton(residual, z, problem)
-        z = _if_finite(better, z)
-        # Break where the solver stepped: equal numbers of its steps per segment, mixed with
-        # uniform spacing as a floor.
+    def _lay_mesh(self, problem: Problem, z: Unknowns) -> tuple[Unknowns, Array]:
+        """Where the mesh's segments should break, as fractions of the horizon: where adaptive
+        integration at `tolerance` steps. Arcs are moved to begin at such breaks."""
         t0, tf = horizon(problem, z)
+        fractions = jnp.linspace(0.0, 1.0, self.arcs + 1, dtype=z.starts.dtype)
+        times = t0 + (tf - t0) * fractions
+        y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
+        solve_arc = lambda y, a, b: diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: canonical_rates(args, t, y)),
+            diffrax.Dopri8(),
+            a,
+            b,
+            None,
+            y,
+            args=problem,
+            saveat=diffrax.SaveAt(steps=True),
+            stepsize_controller=diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance),
+            max_steps=self.max_steps,
+            adjoint=diffrax.ForwardMode(),  # never differentiated: the lightest there is
+            throw=False,
+        )
+        solution = jax.vmap(solve_arc)(y, times[:-1], times[1:])
+        ts, ys = solution.ts, solution.ys  # ts is inf beyond the last step
+        assert ts is not None and ys is not None
+        # Equal numbers of steps per segment, mixed with uniform spacing as a floor.
         scaled = jnp.where(jnp.isfinite(ts), (ts - t0) / (tf - t0), 2.0).reshape(-1)
         order = jnp.argsort(scaled)
         scaled, ys = scaled[order], ys.reshape(-1, ys.shape[2])[order, : 2 * problem.n]
@@ -255,10 +254,10 @@ class Shooting(eqx.Module):
             y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
             return jax.vmap(lambda y, ts: _dopri8(problem, y, ts))(y, times[index])
 
-        def residual(z: Unknowns, problem: Problem) -> tuple[Array, None]:
-            return boundary_residual(problem, z, fly(z, problem)[:, -1]), None
+        def residual(z: Unknowns, problem: Problem) -> Array:
+            return boundary_residual(problem, z, fly(z, problem)[:, -1])
 
-        z = _if_finite(_newton(residual, z, problem)[0], z)
+        z = _if_finite(_newton(residual, z, problem), z)
         arcs = fly(z, problem)
         y = jnp.concatenate([arcs[:, :-1].reshape(-1, arcs.shape[2]), arcs[-1, -1:]])
         t0, tf = horizon(problem, z)
@@ -286,19 +285,17 @@ class Shooting(eqx.Module):
         )
 
 
-def _newton(residual: Any, z: Unknowns, problem: Problem) -> tuple[Unknowns, Any]:
-    """The root, differentiated implicitly, and the residual's auxiliary output near it."""
-    solution = optx.root_find(
+def _newton(residual: Any, z: Unknowns, problem: Problem) -> Unknowns:
+    """The root, differentiated implicitly."""
+    return optx.root_find(
         residual,
         optx.Newton(rtol=1e-12, atol=1e-12, linear_solver=SmallLU()),
         z,
         problem,
-        has_aux=True,
         max_steps=20,
         adjoint=optx.ImplicitAdjoint(linear_solver=SmallLU()),
         throw=False,
-    )
-    return solution.value, solution.aux
+    ).value
 
 
 def _if_finite(new: Unknowns, old: Unknowns) -> Unknowns:

@@ -1,0 +1,87 @@
+"""Yan, Fahroo & Ross, "Real-Time Computation of Neighboring Optimal Control Laws" (AIAA GNC, 2002):
+the low-thrust Earth-Mars transfer, computed beside the paper's Table 2 and beside a reference.
+"""
+
+import contextlib
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from jaxguide.montecarlo.sweep import sweep
+from jaxguide.neighboring.gains import gain_schedule
+from jaxguide.problems import earth_mars
+from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
+from jaxguide.progress import NoProgress, Progress
+from jaxguide.reproduce.earth_mars import sections
+from jaxguide.reproduce.earth_mars.collocation import gain_errors, wrong_sign_histories
+from jaxguide.reproduce.earth_mars.flights import METHOD, TABLE_NODES, fly_cases, reoptimise
+from jaxguide.reproduce.earth_mars.published import CASES
+from jaxguide.reproduce.report import Report
+from jaxguide.solving import solve
+from jaxguide.spectral import nodes_lgl
+
+SWEEP_CASES = 10_000
+
+
+def run(out: Path | None = None, progress: Progress | None = None) -> Report:
+    """Everything of the paper, with its figures in the folder `out` if there is one.
+
+    Most of the time goes into tracing and compiling, so few programs are made, each of one shape,
+    and what NumPy and LAPACK do runs beside, on another core.
+    """
+    report = Report("Earth-Mars transfer: neighbouring optimal control (Yan, Fahroo & Ross 2002)")
+    stages = Stages(report, NoProgress() if progress is None else progress, 4 + (out is not None))
+    with contextlib.closing(stages), ThreadPoolExecutor(1) as beside:
+        with stages("nominal"):
+            extremal = solve(EarthMars(), METHOD)
+        times = np.arange(round(float(extremal.final_time) / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
+        nodes = nodes_lgl(TABLE_NODES)[0]
+        instants = times[:, None] + SAMPLE_INTERVAL * (nodes[None, :] + 1) / 2
+        with stages("gains"):
+            wrong_beside = beside.submit(wrong_sign_histories, extremal, times, instants)
+            again_beside = [beside.submit(reoptimise, case) for case in CASES]
+            errors_beside = beside.submit(gain_errors, extremal)
+            exact = gain_schedule(extremal, times)
+            paper = gain_schedule(extremal, times, "least_squares", nodes=65)
+        with stages("sweep"):
+            mission = earth_mars.mission(extremal)
+            dataset = sweep(mission, earth_mars.dispersions(), SWEEP_CASES, 0)
+        with stages("six flights"):
+            flights = fly_cases(extremal, exact, paper, wrong_beside.result(), instants)
+            reoptimised = [future.result() for future in again_beside]
+            errors = errors_beside.result()
+        sections.nominal(report, extremal)
+        sections.gains(report, exact, paper)
+        sections.gain_errors(report, errors)
+        sections.table_2(report, flights, reoptimised)
+        sections.wrong_sign(report, flights, reoptimised)
+        sections.dispersed(report, dataset)
+        if out is not None:
+            from jaxguide.reproduce.earth_mars.figures import write_figures
+
+            with stages("figures"):
+                shown = (extremal, exact, flights["lstsq64_interp"], reoptimised, errors, dataset)
+                report.figures = write_figures(out, *shown)
+    return report
+
+
+class Stages:
+    """Names, times and shows the stages of a reproduction."""
+
+    def __init__(self, report: Report, progress: Progress, count: int):
+        self.report, self.progress, self.count, self.done = report, progress, count, 0
+        self.state = progress.init()
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.report.timings[name] = time.perf_counter() - began
+        self.done += 1
+        self.state = self.progress.step(self.state, self.done / self.count)
+
+    def close(self) -> None:
+        self.progress.close(self.state)
