@@ -151,6 +151,14 @@ gain = eqx.filter_jit(lambda schedule, t: schedule(t))
 history = eqx.filter_jit(lambda schedule, t_k, t: schedule.history(t_k, t))
 
 
+def flags(schedule):
+    """The reason of every time, as a list of names."""
+    names = ("successful", "gain_unresolved", "conjugate_point", "not_minimising")
+    codes = np.asarray(schedule.result._value)
+    code = {int(getattr(jg.RESULTS, name)._value): name for name in names}
+    return [code[int(c)] for c in codes]
+
+
 @pytest.fixture(scope="session")
 def earth_mars():
     return jg.solve(EarthMars(), jg.Shooting(starts=8))
@@ -200,18 +208,8 @@ def compilations():
     jax.monitoring.unregister_event_duration_listener(listen)
 
 
-KNOWN = ("test_solve.py::test_vmap_equals_a_loop",)  # its count of traces is not met
-
-
 @pytest.fixture(autouse=True, scope="module")
 def release_compiled_programs():
     """Thousands of compiled programs in one process exhaust its memory maps and abort it."""
     yield
     jax.clear_caches()
-
-
-def pytest_collection_modifyitems(items):
-    for item in items:
-        slow = item.get_closest_marker("slow") is not None and "test_reproduce" not in item.nodeid
-        if slow or any(name in item.nodeid for name in KNOWN):
-            item.add_marker(pytest.mark.xfail(reason="known fault, see KNOWN"))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 
 import jaxguide
 from jaxguide import cli, doctor, plotting, problems, reproduce
@@ -19,11 +20,6 @@ from jaxguide.reproduce.report import Report
 from jaxguide.types import RESULTS, UnknownName
 
 N, M, T = 2, 1, 5
-
-
-class Figure:
-    def savefig(self, path, **options):
-        path.write_bytes(b"")
 
 
 def problem(name):
@@ -238,9 +234,11 @@ def test_configure(tmp_path, given):
 def test_progress_meters_fit_diffrax():
     import diffrax
 
-    from jaxguide.progress import NoProgress, RichProgress
+    from jaxguide.progress import NoProgress, Progress, RichProgress
 
-    for meter in (NoProgress(), RichProgress("x", delay=0.0), diffrax.NoProgressMeter()):
-        state = meter.init()
-        state = meter.step(state, jax.numpy.asarray(0.5))
-        meter.close(state)
+    bar = RichProgress("x", delay=0.0)
+    assert all(isinstance(m, Progress) for m in (NoProgress(), bar, diffrax.NoProgressMeter()))
+    state = bar.step(bar.init(), jax.numpy.asarray(0.5))
+    assert state[0].tasks[0].percentage == 50.0
+    bar.close(state)
+    assert NoProgress().step(NoProgress().init(), 0.5) is None

@@ -243,6 +243,7 @@ def test_vmap_equals_a_loop_for_all(of_thrust, batch):
 
 
 def test_new_parameters_compile_nothing(double_integrator, compilations):
+    jg.solve(DoubleIntegrator(), SMALL)
     before = compilations()
     e = jg.solve(dataclasses.replace(DoubleIntegrator(), k=3.0, final_time=2.0), SMALL)
     # J = 6 / (k^2 T^3)
