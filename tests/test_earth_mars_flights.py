@@ -43,9 +43,8 @@ def check_table(errors, name):
     want = np.array(FINAL_ERRORS[name])
     # 1 per cent or 2e-9, as the reference itself was computed.
     assert np.all(np.abs(errors - want) <= np.maximum(0.01 * np.abs(want), 2e-9)), errors - want
-    assert np.all(
-        errors[:, 0] > 0
-    )  # r(tf) cannot beat the optimum's by a constraint miss this small
+    if name != "lstsq64_zoh_u":  # near-optimal laws gain radius by what their ends miss
+        assert np.all(errors[:, 0] > 0)
 
 
 @pytest.mark.parametrize(
@@ -59,12 +58,7 @@ def check_table(errors, name):
 def test_table_2_with_the_papers_gains(earth_mars, paper_schedule, name, hold):
     # Eight steps a sample: 20 rad/TU times 0.0025 TU is 0.05 rad a step; its fourth power over 120
     # and 0.1 TU of turn leave 1e-10 of velocity.
-    errors = final_errors(earth_mars, paper_schedule, hold, jg.RungeKutta4(8))
-    if name == "lstsq64_zoh_u":
-        want = np.array(FINAL_ERRORS[name])
-        assert np.all(np.abs(errors - want) <= np.maximum(0.01 * np.abs(want), 2e-9))
-    else:
-        check_table(errors, name)
+    check_table(final_errors(earth_mars, paper_schedule, hold, jg.RungeKutta4(8)), name)
 
 
 def test_table_2_with_exact_gains(earth_mars, schedule):
@@ -99,16 +93,17 @@ def mean_squared_miss(schedule):
 def test_gradients_of_the_miss_of_200_flights(mean_squared_miss):
     # 3.32 / 0.0203 = 163.5: the number of samples is the same a little to either side.
     design = jnp.array([0.0203, 0.1405, 1.0])
-    forward = jax.jit(mean_squared_miss)
     gradient = jax.jit(jax.grad(mean_squared_miss))(design)
     # Gains of 1e5 at the last sample turn the rounding of states into 1e-17 of the miss and make it
     # curve within 5e-5 TU of interval (that sample moves 164 times as far) and 1e-6 of thrust:
-    # too noisy for differences of 1e-6, so the slope of a polynomial through 61 points.
-    nodes = np.cos(np.pi * (np.arange(61) + 0.5) / 61)
+    # too noisy for differences, so the slope of a polynomial through 1,501 points. (Through 61 the
+    # noise of the slope is 6e-7 of it.)
+    nodes = np.cos(np.pi * (np.arange(1501) + 0.5) / 1501)
+    along = jax.jit(lambda step: jax.lax.map(lambda s: mean_squared_miss(design + s * step), nodes))
     wants = []
-    for i, width in enumerate((4.5e-5, 5e-7, 1e-2)):
-        values = [float(forward(design.at[i].add(width * s))) for s in nodes]
-        fit = np.polynomial.Chebyshev.fit(nodes, values, 11, domain=[-1, 1])
+    for i, width in enumerate((3e-5, 5e-7, 1e-2)):
+        values = along(width * jnp.eye(3)[i])
+        fit = np.polynomial.Chebyshev.fit(nodes, values, 9, domain=[-1, 1])
         wants.append(float(fit.deriv()(0.0)) / width)
     np.testing.assert_allclose(gradient, wants, rtol=1e-6)
     assert np.all(np.asarray(gradient) != 0)

@@ -2,7 +2,6 @@
 
 import types
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ from matplotlib.figure import Figure
 from jaxguide import plotting, reproduce
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars import collocation
-from jaxguide.reproduce.earth_mars import flights as cases
 from jaxguide.reproduce.earth_mars.published import STATES, UNITS
-from jaxguide.spectral import differentiation_matrix, interpolate, nodes_lgl
+from jaxguide.spectral import differentiation_matrix, nodes_lgl
 
 SEGMENTS, P = 3, 5
 
@@ -179,29 +177,3 @@ def test_host_collocation_of_the_double_integrator():
     for square in (False, True):
         K = U @ collocation.horizon(t, system, square)[0]
         np.testing.assert_allclose(K, [[-1.5, -2.0]], atol=1e-12)
-
-
-def test_tabulated_law_looks_up_and_holds():
-    """Cubic histories on two samples come back exactly, at once and held."""
-    nodes = jnp.asarray(nodes_lgl(6)[0])
-    t = jnp.stack([0.5 * (nodes + 1) / 2, 0.5 + 0.5 * (nodes + 1) / 2])
-    maps = jnp.stack([t**3, t, -t], axis=2)[:, :, None, :]
-    table = cases.Table(jnp.zeros((2, 3)), (t**2)[:, :, None], maps)
-    law = cases.Tabulated(table, nodes, jnp.asarray(0.5))
-    command, _ = law(jnp.asarray(0.5), jnp.asarray([2.0, 1.0, 0.0]), None)
-    for kind, at_nominal, at_deviation in ((0, 0.7, 0.7), (1, 0.7, 0.5), (2, 0.5, 0.5)):
-        flown = cases.Clocked(jnp.asarray(kind))(command, jnp.asarray(0.5))
-        nominal, deviation = flown.nominal(jnp.asarray(0.7)), flown.deviation(jnp.asarray(0.7))
-        np.testing.assert_allclose(nominal, [at_nominal**2], atol=1e-14)
-        np.testing.assert_allclose(deviation, [2 * at_deviation**3 + at_deviation], atol=1e-14)
-
-
-def test_table_resolves_the_sharpest_turn():
-    """Twelve points on a sample: a pole 0.05 TU off the axis leaves 1e-11 at worst."""
-    nodes = jnp.asarray(nodes_lgl(cases.TABLE_NODES)[0])
-    turn = lambda t: jnp.arctan((t - 1.69) / 0.05)
-    middle = 1.69 + 0.005
-    values = turn(middle + 0.01 * nodes)[:, None]
-    tau = jnp.linspace(-1.0, 1.0, 101)
-    got = jax.vmap(lambda s: interpolate(nodes, values, s))(tau)[:, 0]
-    np.testing.assert_allclose(got, turn(middle + 0.01 * tau), atol=1e-11)

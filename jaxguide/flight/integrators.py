@@ -56,30 +56,29 @@ class RungeKutta4(Integrator):
         """
         h = width / self.steps
         held = deviation[0] if len(deviation) == 1 else None
-        for i in range(self.steps):
-            order = (2 * i, 2 * i + 1, 2 * i + 1, 2 * i + 2)
-            controls = [_stack([nominal[j] for j in order])]
-            if held is None:
-                controls.append(_stack([deviation[j] for j in order]))
-            s = t + i * h
-            rows = (
-                jnp.stack([0 * h, h / 2, h / 2, h]),
-                jnp.stack([0 * h, h / 6, h / 3, h / 3]),
-                jnp.stack([s, s + h / 2, s + h / 2, s + h]),
-                tuple(controls),
-            )
+        order = [[2 * i, 2 * i + 1, 2 * i + 1, 2 * i + 2] for i in range(self.steps)]
+        by_stage = lambda entries: _stack([_stack([entries[j] for j in row]) for row in order])
+        controls = (by_stage(nominal),) + (() if held is not None else (by_stage(deviation),))
+        starts = [t + i * h for i in range(self.steps)]
+        rows = (jnp.stack([jnp.stack([s, s + h / 2, s + h / 2, s + h]) for s in starts]), controls)
+        weights = (
+            jnp.stack([0 * h, h / 2, h / 2, h]),
+            jnp.stack([0 * h, h / 6, h / 3, h / 3]),
+        )
+
+        def step(x: Lanes, row: tuple) -> tuple[Lanes, None]:
+            zero = tuple(jnp.zeros_like(v) for v in x)
 
             def stage(carry: tuple, row: tuple) -> tuple[tuple, None]:
                 total, k = carry
-                a, w, s, parts = row
-                extra = parts[1] if held is None else held
-                u = _move(parts[0], 1.0, extra)
-                return (_move(total, w, k), rate(s, _move(x, a, k), u)), None  # noqa: B023
+                s, parts, a, w = row
+                u = _move(parts[0], 1.0, parts[1] if held is None else held)
+                return (_move(total, w, k), rate(s, _move(x, a, k), u)), None
 
-            zero = tuple(jnp.zeros_like(v) for v in x)
-            (total, k), _ = jax.lax.scan(stage, (x, zero), rows)
-            x = _move(total, h / 6, k)
-        return x
+            (total, k), _ = jax.lax.scan(stage, (x, zero), (*row, *weights))
+            return _move(total, h / 6, k), None
+
+        return jax.lax.scan(step, x, rows, unroll=min(self.steps, 2))[0]
 
 
 class Adaptive(Integrator):

@@ -20,7 +20,7 @@ from jaxguide.neighboring.segmented import (
     propagate,
     solve_sweeps,
 )
-from jaxguide.problem import bounds_of, is_free
+from jaxguide.problem import Problem, bounds_of, is_free
 from jaxguide.spectral import interpolate
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, is_traced, require_x64
@@ -134,7 +134,7 @@ def gain_schedule(
     times: Any,
     method: str = "segmented",
     nodes: int | None = None,
-    segments: int = 64,
+    segments: int = 72,
     sweeps: int = 8,
     parameters: tuple[str, ...] = (),
     tolerance: float = 1e-6,
@@ -236,7 +236,7 @@ def _segmented(
         error=error,
         resolved=fine_enough & convex_ahead & ~conjugate,
         result=result,
-        bound_active=_bound_active(extremal, times),
+        bound_active=_bound_active(problem, pair.control),
         K_parameters=gains.K[0, :, :, n : n + p],
         K_target=gains.K[0, :, :, n + p :],
         dtf_dx=gains.time[0, :, :n],
@@ -245,10 +245,9 @@ def _segmented(
     )
 
 
-def _bound_active(extremal: Extremal, times: Array) -> Bool[Array, " time"]:
+def _bound_active(problem: Problem, u: Float[Array, "time m"]) -> Bool[Array, " time"]:
     """Where a control sits on its bound, so that a linear law is one-sided there."""
-    lo, hi = bounds_of(extremal.problem.control_bounds, extremal.problem.m, times.dtype)
-    u = extremal(times).u
+    lo, hi = bounds_of(problem.control_bounds, problem.m, u.dtype)
     room = 1e-6 * (1 + jnp.abs(u))
     return jnp.any((u <= lo[None] + room) | (u >= hi[None] - room), axis=1)
 

@@ -212,6 +212,7 @@ class Pair(NamedTuple):
     sweep: Sweep
     finer: Sweep
     at_times: Canonical
+    control: Float[Array, "time m"]  # of the extremal, at the requested times
     convex: Array  # by segment: H_uu positive definite at its nodes
 
 
@@ -244,7 +245,9 @@ def solve_sweeps(
     middle = (breaks[1:] + breaks[:-1]) / 2
     where = [middle[None, :] + (widths / 2)[None, :] * tau[:, None] for tau in taus]
     everywhere = jnp.concatenate([where[0].reshape(-1), where[1].reshape(-1), times])
-    c, convex = jax.vmap(lambda t: canonical_at(problem, t, extremal(t), parameters))(everywhere)
+    points = extremal(everywhere)
+    at_points = jax.vmap(lambda t, point: canonical_at(problem, t, point, parameters))
+    c, convex = at_points(everywhere, points)
     M = jnp.concatenate([c.M * ratio[None], c.b / scale[None, :, None]], axis=2)
     first, second = counts[0] * segments, sum(counts) * segments
     by_node = lambda a, s: a.reshape(s, segments, two_n, -1).transpose(0, 2, 3, 1)
@@ -272,22 +275,22 @@ def solve_sweeps(
         for i, slopes in enumerate((slopes1, slopes2))
     ]
     at_times = jax.tree_util.tree_map(lambda a: a[second:], c)
-    return Pair(
-        pair[0], pair[1], at_times, jnp.all(convex[:first].reshape(counts[0], segments), axis=0)
-    )
+    convex = jnp.all(convex[:first].reshape(counts[0], segments), axis=0)
+    return Pair(pair[0], pair[1], at_times, points.u[second:], convex)
 
 
 def _probe_times(extremal: Extremal) -> Array:
     """Times to look for rapid change: evenly within each of the extremal's own segments, and
-    geometrically towards the end."""
+    geometrically towards the end of the last."""
     breaks = extremal.breaks
     per = max(8, -(-_PROBES // (breaks.shape[0] - 1)))
-    inner = jnp.linspace(0.0, 1.0, per + 1, dtype=breaks.dtype)[:-1]
-    times = breaks[:-1, None] + jnp.diff(breaks)[:, None] * inner[None, :]
-    graded = breaks[-1] - (breaks[-1] - breaks[0]) * 2.0 ** -jnp.arange(
-        8.0, 18.0, dtype=breaks.dtype
-    )
-    return jnp.sort(jnp.concatenate([times.reshape(-1), graded, breaks[-1:]]))
+    even = np.arange(per) / per
+    # Sorted here, not in the program: XLA's sort would take longer than all the rest.
+    last = np.unique(np.append(even, 1 - 2.0 ** -np.arange(1.0, 13.0)))
+    even, last = (jnp.asarray(v, breaks.dtype) for v in (even, last))
+    times = breaks[:-2, None] + jnp.diff(breaks)[:-1, None] * even[None, :]
+    graded = breaks[-2] + (breaks[-1] - breaks[-2]) * last
+    return jnp.concatenate([times.reshape(-1), graded, breaks[-1:]])
 
 
 class Gains(NamedTuple):
@@ -356,8 +359,10 @@ def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
     last = sweep.breaks.shape[0] - 2
     at = jax.vmap(sweep.locate)(times)
     segments = jnp.arange(last, dtype=at.dtype)
-    whole = jax.vmap(crossed)(segments, sweep.breaks[:-2])
-    own = jax.vmap(crossed)(at, times) & (at < last)
+    found = jax.vmap(crossed)(
+        jnp.concatenate([segments, at]), jnp.concatenate([sweep.breaks[:-2], times])
+    )
+    whole, own = found[:last], found[last:] & (at < last)
     return own | jnp.any(whole[None, :] & (segments[None, :] > at[:, None]), axis=1)
 
 

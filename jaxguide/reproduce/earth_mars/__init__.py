@@ -17,11 +17,10 @@ from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
 from jaxguide.progress import NoProgress, Progress
 from jaxguide.reproduce.earth_mars import sections
 from jaxguide.reproduce.earth_mars.collocation import gain_errors, wrong_sign_histories
-from jaxguide.reproduce.earth_mars.flights import METHOD, TABLE_NODES, fly_cases, reoptimise
+from jaxguide.reproduce.earth_mars.flights import METHOD, fly_cases, reoptimise, stage_times
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.reproduce.report import Report
 from jaxguide.solving import solve
-from jaxguide.spectral import nodes_lgl
 
 SWEEP_CASES = 10_000
 
@@ -38,10 +37,8 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
         with stages("nominal"):
             extremal = solve(EarthMars(), METHOD)
         times = np.arange(round(float(extremal.final_time) / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
-        nodes = nodes_lgl(TABLE_NODES)[0]
-        instants = times[:, None] + SAMPLE_INTERVAL * (nodes[None, :] + 1) / 2
         with stages("gains"):
-            wrong_beside = beside.submit(wrong_sign_histories, extremal, times, instants)
+            wrong_beside = beside.submit(wrong_sign_histories, extremal, stage_times(times))
             again_beside = [beside.submit(reoptimise, case) for case in CASES]
             errors_beside = beside.submit(gain_errors, extremal)
             exact = gain_schedule(extremal, times)
@@ -50,7 +47,7 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
             mission = earth_mars.mission(extremal)
             dataset = sweep(mission, earth_mars.dispersions(), SWEEP_CASES, 0)
         with stages("six flights"):
-            flights = fly_cases(extremal, exact, paper, wrong_beside.result(), instants)
+            flights = fly_cases(exact, paper, wrong_beside.result())
             reoptimised = [future.result() for future in again_beside]
             errors = errors_beside.result()
         sections.nominal(report, extremal)

@@ -118,13 +118,16 @@ def gain_errors(extremal: Extremal) -> dict[str, dict[float, dict[int, float]]]:
 
 
 def segmented_gains(extremal: Extremal, tau: float) -> dict[int, np.ndarray]:
-    """Points -> K(tau) by the library's own breaks and collocation on SEGMENTS segments.
+    """Points -> K(tau) by the library's own breaks and collocation, on ever more SEGMENTS.
 
-    Shorter lists of segments are filled with empty ones, so that all are one program.
+    Coarser meshes keep every k-th break, and are filled with empty segments: all are one program.
     """
     span = np.linspace(tau, float(extremal.final_time), 401)
     _, (M, U, psi) = at(extremal, span)
-    breaks = np.asarray(_breaks(jnp.asarray(span), jnp.asarray(M)))
+    finest = np.asarray(_breaks(jnp.asarray(span), jnp.asarray(M), SEGMENTS[-1]))
+    stride = [SEGMENTS[-1] // s for s in SEGMENTS]
+    fill = lambda b: np.pad(b, (0, len(finest) - len(b)), mode="edge")
+    breaks = np.stack([fill(finest[::k]) for k in stride])
     widths = np.diff(breaks)
     nodes = nodes_lg(SEGMENT_NODES)[0]
     t = breaks[:, None, :-1] + widths[:, None, :] * (nodes[None, :, None] + 1) / 2
@@ -141,11 +144,7 @@ def segmented_gains(extremal: Extremal, tau: float) -> dict[int, np.ndarray]:
     return found
 
 
-@jax.jit
-def _breaks(t: Array, M: Array) -> Float[Array, "size break"]:
-    breaks = [place_breaks(t, M, s) for s in SEGMENTS]
-    longest = SEGMENTS[-1] + 1
-    return jnp.stack([jnp.pad(b, (0, longest - b.shape[0]), mode="edge") for b in breaks])
+_breaks = jax.jit(place_breaks, static_argnums=2)
 
 
 @jax.jit
@@ -153,9 +152,10 @@ def _across(M: Array, widths: Array) -> Float[Array, "size row column segment"]:
     return jax.vmap(lambda M, w: collocate(M, w, None, 12)[1])(M, widths)
 
 
-def wrong_sign_histories(extremal: Extremal, times: np.ndarray, instants: np.ndarray) -> np.ndarray:
-    """Control histories of eq. (49) at the `instants` of every sample, with -H_uu in place of H_uu
-    in eqs (16)-(21) and H_xx as it is."""
+def wrong_sign_histories(extremal: Extremal, instants: np.ndarray) -> np.ndarray:
+    """Control histories of eq. (49) at the `instants` of every sample, from the first of each on,
+    with -H_uu in place of H_uu in eqs (16)-(21) and H_xx as it is."""
+    times = instants[:, 0]
     nodes, half = nodes_lgl(WRONG_SIGN_NODES)[0], (float(extremal.final_time) - times) / 2
     grids = times[:, None] + half[:, None] * (nodes[None, :] + 1)
     _, (M, U, psi) = at(extremal, grids.reshape(-1), sign=-1.0)

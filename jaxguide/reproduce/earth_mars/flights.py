@@ -1,120 +1,29 @@
 """The six cases of Table 1: flown by every variant of the law at once, and re-optimised."""
 
 import dataclasses
-from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jaxguide.flight.integrators import Adaptive
+from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
-from jaxguide.flight.simulate import Flight, simulate
-from jaxguide.laws.holds import Hold
-from jaxguide.laws.law import Command, Law
+from jaxguide.flight.simulate import Flight, Prepared, prepare, simulate
+from jaxguide.laws.holds import History
+from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.nominal.shooting import Shooting
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
-from jaxguide.reproduce.earth_mars.collocation import at
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.solving import solve
-from jaxguide.spectral import interpolate, nodes_lgl
 from jaxguide.trajectory import Extremal
-from jaxguide.types import RESULTS
 
 METHOD = Shooting(starts=8)  # one compiled program serves the nominal and the six re-solves
-TABLE_NODES = 12  # points a sample at which histories are tabulated: see `Tabulated`
-
-
-class Table(NamedTuple):
-    """A neighbouring-optimal law at points of every sample; leaves have a leading sample axis."""
-
-    x: Float[Array, "*k n"]  # nominal, at the sample
-    u: Float[Array, "*k stage m"]  # nominal
-    maps: Float[Array, "*k stage m n"]  # du per deviation at the sample, eq. (49)
-
-
-class Tabulated(Law):
-    """`NeighboringOptimal`, looked up in a Table.
-
-    All variants then share one small program, which adaptive flights interpolate. The control's
-    nearest singularity is some 0.05 TU from the real axis, so that twelve Legendre points on a
-    sample of 0.02 TU leave 1e-12.
-    """
-
-    table: Table
-    nodes: Float[Array, " stage"]
-    interval: Float[Array, ""]
-
-    def start(self, x0: Array) -> None:
-        return None
-
-    def __call__(self, t_k: Any, x: Array, memory: None) -> tuple["TabulatedCommand", None]:
-        k = jnp.round(t_k / self.interval).astype(int)
-        one = jax.tree_util.tree_map(lambda a: a[k], self.table)
-        command = TabulatedCommand(
-            law=self,
-            one=one,
-            t_k=t_k,
-            dx=x - one.x,
-            result=RESULTS.successful,
-            saturated=jnp.array(False),
-        )
-        return command, None
-
-
-class TabulatedCommand(Command):
-    """What `Tabulated` orders from `t_k` on."""
-
-    law: Tabulated
-    one: Table
-    t_k: Float[Array, ""]
-    dx: Float[Array, " n"]
-    result: RESULTS
-    saturated: Bool[Array, ""]
-
-    def _look_up(self, table: Array, t: Any) -> Array:
-        return interpolate(self.law.nodes, table, 2 * (t - self.t_k) / self.law.interval - 1)
-
-    def nominal(self, t: Any) -> Float[Array, " m"]:
-        return self._look_up(self.one.u, t)
-
-    def deviation(self, t: Any) -> Float[Array, " m"]:
-        return self._look_up(self.one.maps, t) @ self.dx
-
-
-class Clocked(Hold):
-    """History (kind 0), HoldDeviation (1) or HoldControl (2); `kind` may be traced, so that one
-    program flies all three."""
-
-    kind: Array
-
-    def __call__(self, command: Command, t_k: Any) -> "ClockedCommand":
-        return ClockedCommand(
-            command=command,
-            t_k=t_k,
-            kind=self.kind,
-            result=command.result,
-            saturated=command.saturated,
-        )
-
-
-class ClockedCommand(Command):
-    """What is held is asked at the sample's time, what is not at its own."""
-
-    command: Command
-    t_k: Float[Array, ""]
-    kind: Array
-    result: RESULTS
-    saturated: Bool[Array, ""]
-
-    def nominal(self, t: Any) -> Float[Array, " m"]:
-        return self.command.nominal(jnp.where(self.kind == 2, self.t_k, t))
-
-    def deviation(self, t: Any) -> Float[Array, " m"]:
-        return self.command.deviation(jnp.where(self.kind == 0, t, self.t_k))
+# The control turns by 20 rad/TU, that is 0.025 rad a step: its fourth power over 120 is 3e-9, of a
+# control that moves the end by 0.1 LU.
+INTEGRATOR = RungeKutta4(16)
 
 
 def reoptimise(case: tuple[float, ...]) -> Extremal:
@@ -123,58 +32,62 @@ def reoptimise(case: tuple[float, ...]) -> Extremal:
     return solve(dataclasses.replace(EarthMars(), initial_state=start), METHOD)
 
 
+def stage_times(times: np.ndarray) -> np.ndarray:
+    """When the integrator asks for the control, within each sample."""
+    return times[:, None] + SAMPLE_INTERVAL * np.asarray(INTEGRATOR.stages)[None, :]
+
+
 def fly_cases(
-    extremal: Extremal,
-    exact: GainSchedule,
-    paper: GainSchedule,
-    wrong: np.ndarray,
-    instants: np.ndarray,
+    exact: GainSchedule, paper: GainSchedule, wrong: Float[np.ndarray, "sample stage m n"]
 ) -> dict[str, Flight]:
-    """Variant -> the six flights of Table 1, batched. `wrong`: histories at the `instants`."""
-    u = at(extremal, instants.reshape(-1))[0].u.reshape(*instants.shape, -1)
-    x = at(extremal, instants[:, 0])[0].x
-    of_paper, of_exact = (np.asarray(_histories(s, jnp.asarray(instants))) for s in (paper, exact))
+    """Variant -> the six flights of Table 1, batched. `wrong`: histories at the `stage_times`.
+
+    The variants differ only in what is looked up at the integrator's stages, so one program flies
+    them all, each on the history of a law prepared for it.
+    """
+    mission = _mission(exact)
+    times, grid, of_exact = _prepare(mission)
+    of_paper = _prepare(_mission(paper)).laws
+    assert isinstance(of_exact, PreparedNeighboring) and isinstance(of_paper, PreparedNeighboring)
+    constant = lambda a: jnp.broadcast_to(a[:, :1], a.shape)
+    maps = lambda law, maps: dataclasses.replace(law, maps=maps, K=maps[:, 0])
+    held = maps(of_paper, constant(of_paper.maps))
     variants = {
-        "lstsq64_interp": (of_paper, 0),
-        "lstsq64_zoh_du": (of_paper, 1),
-        "lstsq64_zoh_u": (of_paper, 2),
-        "exact_interp": (of_exact, 0),
-        "wrong sign": (wrong, 0),
+        "lstsq64_interp": of_paper,
+        "lstsq64_zoh_du": held,
+        "lstsq64_zoh_u": dataclasses.replace(held, u_nominal=constant(held.u_nominal)),
+        "exact_interp": of_exact,
+        "wrong sign": maps(of_paper, jnp.asarray(wrong)),
     }
-    maps = jnp.asarray(np.stack([maps for maps, _ in variants.values()]))
-    kinds = jnp.asarray([kind for _, kind in variants.values()])
-    table = Table(jnp.asarray(x), jnp.asarray(u), maps[0])
-    nodes = jnp.asarray(nodes_lgl(TABLE_NODES)[0])
-    mission = Mission(
-        extremal.problem,
-        Tabulated(table, nodes, jnp.asarray(SAMPLE_INTERVAL)),
-        extremal.x[0],
-        SAMPLE_INTERVAL,
-        hold=Clocked(kinds[0]),
-        integrator=Adaptive(1e-11),
-    )
-    flights = jax.device_get(_fly(mission, maps, kinds, jnp.asarray(CASES)))
+    laws = jax.tree_util.tree_map(lambda *leaves: np.stack(leaves), *variants.values())
+    flights = jax.device_get(_fly(mission, Prepared(times, grid, laws), jnp.asarray(CASES)))
     pick = lambda k: jax.tree_util.tree_map(lambda a: a[k], flights)
     return {name: pick(k) for k, name in enumerate(variants)}
 
 
-@eqx.filter_jit
-def _histories(schedule: GainSchedule, instants: Array) -> Float[Array, "sample instant m n"]:
-    within = jax.vmap(schedule.history, in_axes=(None, 0))
-    return jax.vmap(within)(schedule.times, instants)
+def _mission(schedule: GainSchedule) -> Mission:
+    extremal = schedule.extremal
+    law, start = NeighboringOptimal(schedule), extremal.x[0]
+    return Mission(
+        extremal.problem, law, start, SAMPLE_INTERVAL, hold=History(), integrator=INTEGRATOR
+    )
+
+
+_prepare = eqx.filter_jit(prepare)
 
 
 @eqx.filter_jit
-def _fly(mission: Mission, maps: Array, kinds: Array, deviations: Array) -> Flight:
+def _fly(mission: Mission, prepared: Prepared, deviations: Array) -> Flight:
     """Every variant with every deviation: one `vmap` over all, which traces half of what two do."""
 
-    def one(maps: Array, kind: Array, dx: Array) -> Flight:
-        where = lambda m: (m.law.table.maps, m.hold.kind, m.initial_state)
-        return simulate(eqx.tree_at(where, mission, (maps, kind, mission.initial_state + dx)))
+    def one(law: PreparedNeighboring, dx: Array) -> Flight:
+        start = mission.initial_state + dx
+        flown = eqx.tree_at(lambda m: m.initial_state, mission, start)
+        return simulate(flown, prepared=prepared._replace(laws=law))
 
-    variants, cases = maps.shape[0], deviations.shape[0]
-    each = lambda a: jnp.repeat(a, cases, axis=0)
-    flights = jax.vmap(one)(each(maps), each(kinds), jnp.tile(deviations, (variants, 1)))
+    variants, cases = jax.tree_util.tree_leaves(prepared.laws)[0].shape[0], deviations.shape[0]
+    laws = jax.tree_util.tree_map(lambda a: jnp.repeat(a, cases, axis=0), prepared.laws)
+    flights = jax.vmap(one)(laws, jnp.tile(deviations, (variants, 1)))
     split = lambda a: a.reshape(variants, cases, *a.shape[1:])
     return jax.tree_util.tree_map(split, flights)
 
