@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxguide.neighboring.linearization import terminal_conditions
+from jaxguide.neighboring.segmented import conjugate_ahead, solve_sweeps
 from jaxguide.nominal.conditions import endpoint_lagrangian
 from jaxguide.problem import Problem, bounds_of, hamiltonian, initial_values, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg, nodes_lgl
@@ -115,8 +117,9 @@ def certify(extremal: Extremal, costly: bool = False) -> Certificate:
     """Checks an extremal against the conditions it should meet, independently of its solver.
 
     **Arguments:** `costly`: also fly the interpolated control with an adaptive integrator
-    (Diffrax, 1e-11) and compare with the extremal's own states. Errors are relative to the size of
-    what is compared, so the tolerances (1e-8 for most) hold in any units.
+    (Diffrax, 1e-11) and compare with the extremal's own states; and look for conjugate points, past
+    which an extremal minimises nothing, by a backward sweep of its second variation. Errors are
+    relative to the size of what is compared, so the tolerances (1e-8 for most) hold in any units.
 
     **Source:** 2002 paper eqs (2)-(9); review, section 4.
     """
@@ -135,6 +138,11 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     if costly:
         flown = _propagate(extremal)
         rows.add("propagated state", states, (flown - x) / (1e-3 + span)[None], t, 1e-8)
+        # The last break with one ahead is just before it: 1 there, 0 where there is none.
+        ahead = _conjugate(extremal)
+        last = jnp.where(jnp.any(ahead), ahead.shape[0] - 1 - jnp.argmax(ahead[::-1]), 0)
+        count = jnp.any(ahead).astype(t.dtype)
+        rows.add_signed("conjugate points", ("one follows",), count, extremal.breaks[last], 0.0)
 
     # Canonical equations, eqs (2) and (6), in integral form on Gauss points between the nodes.
     gauss, weights = (jnp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
@@ -251,6 +259,13 @@ def _propagate(extremal: Extremal) -> Array:
     )
     assert solution.ys is not None
     return solution.ys
+
+
+def _conjugate(extremal: Extremal) -> Bool[Array, " break"]:
+    """Whether a conjugate point lies between each break of the mesh (the last left out) and tf."""
+    terminal, times = terminal_conditions(extremal), extremal.breaks[:-1]
+    pair = solve_sweeps(extremal, terminal, times, 72, 8, 8, ())
+    return conjugate_ahead(pair.sweep, times)
 
 
 _quick = eqx.filter_jit(lambda extremal: _checks(extremal, False))

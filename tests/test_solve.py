@@ -152,6 +152,17 @@ def test_the_costly_row_flies_the_control(earth_mars):
     assert row["where"] in EarthMars.state_names and row["value"] > 1e-6
 
 
+def test_a_conjugate_point_fails_its_row():
+    # x' = u, J = int (u^2 - x^2)/2 on ends given: conjugate pi before the end.
+    for horizon in (3.0, 4.0):
+        e = jg.solve(Regulator(q=(-1.0, -0.25), final_time=horizon), SMALL, throw=False)
+        row = failed(jg.certify(e, costly=True)).get("conjugate points")
+        assert (row is None) == (horizon < np.pi)
+        if row is not None:  # told at the break before it
+            later = np.asarray(e.breaks)[np.asarray(e.breaks) > row["time"]]
+            assert row["time"] < horizon - np.pi <= later[0]
+
+
 # Single shooting and guesses ------------------------------------------------------------------
 
 
