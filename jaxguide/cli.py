@@ -96,6 +96,8 @@ def configure() -> None:
     Called before JAX and Equinox are imported: both read the environment as they are.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # cache hits on CPU are noisy
+    # Source lines in compiled programs serve debuggers and take a tenth of a short run.
+    os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
     # A computation that holds an `eqx.error_if` is a host callback, which is never cached. The
     # library reports failures as values, so none is needed.
     gc.set_threshold(200_000, 20, 20)  # tracing makes objects by the million, few of them garbage
