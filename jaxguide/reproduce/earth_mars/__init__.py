@@ -17,7 +17,13 @@ from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
 from jaxguide.progress import NoProgress, Progress
 from jaxguide.reproduce.earth_mars import sections
 from jaxguide.reproduce.earth_mars.collocation import gain_errors, wrong_sign_histories
-from jaxguide.reproduce.earth_mars.flights import METHOD, fly_cases, reoptimise, stage_times
+from jaxguide.reproduce.earth_mars.flights import (
+    METHOD,
+    fly_cases,
+    histories,
+    reoptimise,
+    stage_times,
+)
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.reproduce.report import Report
 from jaxguide.solving import solve
@@ -37,22 +43,25 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
         with stages("nominal"):
             extremal = solve(EarthMars(), METHOD)
         times = np.arange(round(float(extremal.final_time) / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
+        instants = stage_times(times)
         with stages("gains"):
-            wrong_beside = beside.submit(wrong_sign_histories, extremal, stage_times(times))
-            again_beside = [beside.submit(reoptimise, case) for case in CASES]
-            errors_beside = beside.submit(gain_errors, extremal)
+            wrong = beside.submit(wrong_sign_histories, extremal, instants)
             exact = gain_schedule(extremal, times)
-            paper = gain_schedule(extremal, times, "least_squares", nodes=65)
+            paper = beside.submit(gain_schedule, extremal, times, "least_squares", nodes=65)
+            of_paper = beside.submit(lambda: histories(paper.result(), instants))
+            of_exact = beside.submit(histories, exact, instants)
+            again = [beside.submit(reoptimise, case) for case in CASES]
+            errors = beside.submit(gain_errors, extremal)
         with stages("sweep"):
             mission = earth_mars.mission(extremal)
             dataset = sweep(mission, earth_mars.dispersions(), SWEEP_CASES, 0)
         with stages("six flights"):
-            flights = fly_cases(exact, paper, wrong_beside.result())
-            reoptimised = [future.result() for future in again_beside]
-            errors = errors_beside.result()
+            maps = of_exact.result(), of_paper.result(), wrong.result()
+            flights = fly_cases(exact, instants, *maps)
+            reoptimised = [future.result() for future in again]
         sections.nominal(report, extremal)
-        sections.gains(report, exact, paper)
-        sections.gain_errors(report, errors)
+        sections.gains(report, exact, paper.result())
+        sections.gain_errors(report, errors.result())
         sections.table_2(report, flights, reoptimised)
         sections.wrong_sign(report, flights, reoptimised)
         sections.dispersed(report, dataset)
@@ -60,8 +69,8 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
             from jaxguide.reproduce.earth_mars.figures import write_figures
 
             with stages("figures"):
-                shown = (extremal, exact, flights["lstsq64_interp"], reoptimised, errors, dataset)
-                report.figures = write_figures(out, *shown)
+                shown = (extremal, exact, flights["lstsq64_interp"], reoptimised, errors.result())
+                report.figures = write_figures(out, *shown, dataset)
     return report
 
 

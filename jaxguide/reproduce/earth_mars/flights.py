@@ -10,17 +10,19 @@ from jaxtyping import Array, Float
 
 from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
-from jaxguide.flight.simulate import Flight, Prepared, prepare, simulate
+from jaxguide.flight.simulate import Flight, Prepared, simulate
 from jaxguide.laws.holds import History
+from jaxguide.laws.law import SampleGrid
 from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.nominal.shooting import Shooting
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
+from jaxguide.reproduce.earth_mars.collocation import at
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.solving import solve
 from jaxguide.trajectory import Extremal
 
-METHOD = Shooting(starts=8)  # one compiled program serves the nominal and the six re-solves
+METHOD = Shooting(starts=4)  # one compiled program serves the nominal and the six re-solves
 # The control turns by 20 rad/TU, that is 0.025 rad a step: its fourth power over 120 is 3e-9, of a
 # control that moves the end by 0.1 LU.
 INTEGRATOR = RungeKutta4(16)
@@ -32,48 +34,59 @@ def reoptimise(case: tuple[float, ...]) -> Extremal:
     return solve(dataclasses.replace(EarthMars(), initial_state=start), METHOD)
 
 
-def stage_times(times: np.ndarray) -> np.ndarray:
+def stage_times(times: np.ndarray) -> Float[np.ndarray, "sample stage"]:
     """When the integrator asks for the control, within each sample."""
     return times[:, None] + SAMPLE_INTERVAL * np.asarray(INTEGRATOR.stages)[None, :]
 
 
+def histories(
+    schedule: GainSchedule, instants: Float[np.ndarray, "sample stage"]
+) -> Float[np.ndarray, "sample stage m n"]:
+    """The schedule's own open-loop control at the `instants`, per deviation at each sample."""
+    return np.asarray(_histories(schedule, jnp.asarray(instants)))
+
+
+@eqx.filter_jit
+def _histories(schedule: GainSchedule, instants: Array) -> Float[Array, "sample stage m n"]:
+    within = jax.vmap(schedule.history, in_axes=(None, 0))
+    return jax.vmap(within)(instants[:, 0], instants)
+
+
 def fly_cases(
-    exact: GainSchedule, paper: GainSchedule, wrong: Float[np.ndarray, "sample stage m n"]
+    schedule: GainSchedule,
+    instants: Float[np.ndarray, "sample stage"],
+    of_exact: Float[np.ndarray, "sample stage m n"],
+    of_paper: Float[np.ndarray, "sample stage m n"],
+    wrong: Float[np.ndarray, "sample stage m n"],
 ) -> dict[str, Flight]:
-    """Variant -> the six flights of Table 1, batched. `wrong`: histories at the `stage_times`.
+    """Variant -> the six flights of Table 1, batched, from histories at the `stage_times`.
 
     The variants differ only in what is looked up at the integrator's stages, so one program flies
-    them all, each on the history of a law prepared for it.
+    them all, each on the whole history of a law prepared for it.
     """
-    mission = _mission(exact)
-    times, grid, of_exact = _prepare(mission)
-    of_paper = _prepare(_mission(paper)).laws
-    assert isinstance(of_exact, PreparedNeighboring) and isinstance(of_paper, PreparedNeighboring)
-    constant = lambda a: jnp.broadcast_to(a[:, :1], a.shape)
-    maps = lambda law, maps: dataclasses.replace(law, maps=maps, K=maps[:, 0])
-    held = maps(of_paper, constant(of_paper.maps))
-    variants = {
-        "lstsq64_interp": of_paper,
-        "lstsq64_zoh_du": held,
-        "lstsq64_zoh_u": dataclasses.replace(held, u_nominal=constant(held.u_nominal)),
-        "exact_interp": of_exact,
-        "wrong sign": maps(of_paper, jnp.asarray(wrong)),
-    }
-    laws = jax.tree_util.tree_map(lambda *leaves: np.stack(leaves), *variants.values())
-    flights = jax.device_get(_fly(mission, Prepared(times, grid, laws), jnp.asarray(CASES)))
-    pick = lambda k: jax.tree_util.tree_map(lambda a: a[k], flights)
-    return {name: pick(k) for k, name in enumerate(variants)}
-
-
-def _mission(schedule: GainSchedule) -> Mission:
     extremal = schedule.extremal
     law, start = NeighboringOptimal(schedule), extremal.x[0]
-    return Mission(
+    mission = Mission(
         extremal.problem, law, start, SAMPLE_INTERVAL, hold=History(), integrator=INTEGRATOR
     )
-
-
-_prepare = eqx.filter_jit(prepare)
+    samples, stages = instants.shape
+    x, u = (a.reshape(samples, stages, -1) for a in at(extremal, instants.reshape(-1))[0][:2])
+    held = lambda a: np.broadcast_to(a[:, :1], a.shape)
+    variants = {  # nominal and deviation at the stages
+        "lstsq64_interp": (u, of_paper),
+        "lstsq64_zoh_du": (u, held(of_paper)),
+        "lstsq64_zoh_u": (held(u), held(of_paper)),
+        "exact_interp": (u, of_exact),
+        "wrong sign": (u, wrong),
+    }
+    inside, cap = np.ones(samples, bool), np.full(samples, np.inf)
+    leaves = [(x[:, 0], maps[:, 0], u, maps, cap, inside) for u, maps in variants.values()]
+    laws = PreparedNeighboring(*(jnp.asarray(np.stack(a)) for a in zip(*leaves, strict=True)))
+    grid = SampleGrid(jnp.asarray(instants[:, 0]), jnp.asarray(instants))
+    prepared = Prepared(jnp.asarray(np.append(instants[:, 0], instants[-1, -1])), grid, laws)
+    flights = jax.device_get(_fly(mission, prepared, jnp.asarray(CASES)))
+    pick = lambda k: jax.tree_util.tree_map(lambda a: a[k], flights)
+    return {name: pick(k) for k, name in enumerate(variants)}
 
 
 @eqx.filter_jit
