@@ -39,7 +39,7 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
     """
     report = Report("Earth-Mars transfer: neighbouring optimal control (Yan, Fahroo & Ross 2002)")
     stages = Stages(report, NoProgress() if progress is None else progress, 4 + (out is not None))
-    with contextlib.closing(stages), ThreadPoolExecutor(1) as beside:
+    with contextlib.closing(stages), ThreadPoolExecutor(2) as beside:
         with stages("nominal"):
             extremal = solve(EarthMars(), METHOD)
         times = np.arange(round(float(extremal.final_time) / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
