@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.neighboring.linearization import terminal_conditions
-from jaxguide.neighboring.segmented import conjugate_ahead, solve_sweeps
+from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, conjugate_ahead, solve_sweeps
 from jaxguide.nominal.conditions import endpoint_lagrangian
 from jaxguide.problem import Problem, bounds_of, hamiltonian, initial_values, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg, nodes_lgl
@@ -264,7 +264,7 @@ def _propagate(extremal: Extremal) -> Array:
 def _conjugate(extremal: Extremal) -> Bool[Array, " break"]:
     """Whether a conjugate point lies between each break of the mesh (the last left out) and tf."""
     terminal, times = terminal_conditions(extremal), extremal.breaks[:-1]
-    pair = solve_sweeps(extremal, terminal, times, 72, 8, 8, ())
+    pair = solve_sweeps(extremal, terminal, times, SEGMENTS, NODES, SWEEPS, ())
     return conjugate_ahead(pair.sweep, times)
 
 

@@ -98,9 +98,9 @@ def configure() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # cache hits on CPU are noisy
     # Source lines in compiled programs serve debuggers and take a tenth of a short run.
     os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+    gc.set_threshold(200_000, 20, 20)  # tracing makes objects by the million, few of them garbage
     # A computation that holds an `eqx.error_if` is a host callback, which is never cached. The
     # library reports failures as values, so none is needed.
-    gc.set_threshold(200_000, 20, 20)  # tracing makes objects by the million, few of them garbage
     os.environ.setdefault("EQX_ON_ERROR", "nan")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else idle pools spin beside XLA
     import jax

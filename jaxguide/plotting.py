@@ -210,6 +210,8 @@ def plot_deviations(
 
     **Arguments:** `flights`: a Flight with a leading case axis; `names`: of states (their
     deviation) or controls (the commanded feedback), a panel each; `labels`: one a case.
+
+    **Raises:** `ValueError` for a name that is neither.
     """
     states, controls = _names(extremal.problem)
     t = np.asarray(flights.t)[0]

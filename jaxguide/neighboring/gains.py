@@ -13,6 +13,9 @@ from jaxguide.linalg import solve
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import (
+    NODES,
+    SEGMENTS,
+    SWEEPS,
     Sweep,
     canonical_at,
     conjugate_ahead,
@@ -134,8 +137,8 @@ def gain_schedule(
     times: Any,
     method: str = "segmented",
     nodes: int | None = None,
-    segments: int = 72,
-    sweeps: int = 8,
+    segments: int = SEGMENTS,
+    sweeps: int = SWEEPS,
     parameters: tuple[str, ...] = (),
     tolerance: float = 1e-6,
 ) -> GainSchedule:
@@ -173,7 +176,7 @@ def gain_schedule(
         _check_times(np.asarray(times), float(extremal.t[0]), float(extremal.t[-1]))
     if nodes is not None and nodes < 3:
         raise ValueError(f"nodes is {nodes}; give at least 3 points.")
-    sweep_nodes = 8 if nodes is None or method != "segmented" else nodes
+    sweep_nodes = NODES if nodes is None or method != "segmented" else nodes
     schedule = _segmented(extremal, times, segments, sweep_nodes, sweeps, parameters, tolerance)
     if method == "segmented":
         return schedule

@@ -28,6 +28,7 @@ from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal, Point
 
+SEGMENTS, NODES, SWEEPS = 72, 8, 8  # the defaults: some 1e-9 where a control turns sharply
 _GROUP = 8  # segments joined without renormalising; growth over so few is harmless
 _PROBES = 256
 # Segments shrink towards the end in proportion to the time left, down to this part of the horizon:

@@ -140,7 +140,7 @@ class Shooting(eqx.Module):
 
     def _from_guess(self, problem: Problem, guess: Any, dtype: Any) -> Unknowns:
         """`guess` as unknowns, improved by the coarse Newton where that converges."""
-        z = guess if isinstance(guess, Unknowns) else self._unknowns(problem, guess, dtype)
+        z = self._unknowns(problem, guess, dtype)
         better, norm, _ = damped_newton(problem, z, self._arc_steps, _COARSE_ITERATIONS)
         return jax.tree_util.tree_map(
             lambda a, b: jnp.where(norm < _COARSE_TOLERANCE, a, b), better, z

@@ -7,7 +7,7 @@ import numpy as np
 from jaxguide.flight.simulate import Flight
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.reproduce.earth_mars.collocation import WRONG_SIGN_NODES, at, relative
-from jaxguide.reproduce.earth_mars.flights import final_errors
+from jaxguide.reproduce.earth_mars.flights import INTEGRATOR, final_errors
 from jaxguide.reproduce.earth_mars.published import (
     ANGLES,
     CASES,
@@ -115,7 +115,8 @@ def table_2(report: Report, flights: dict[str, Flight], reoptimised: list[Extrem
         off = np.max(np.abs(finals[i] - REOPTIMISED[i]))
         section.add(f"case {i + 1}: error of x(tf)", off, 0, tolerance=1e-10)
     for name, (words, judged) in VARIANTS.items():
-        text = f"Final state minus the re-optimised one, sixteen steps a sample: {words}."
+        how = f"Runge-Kutta 4, {INTEGRATOR.steps} steps a sample"
+        text = f"Final state minus the re-optimised one, {how}: {words}."
         if name == "lstsq64_interp":
             text += (
                 " The printed numbers are shown, not judged. r(tf) is maximal on the re-optimised "
