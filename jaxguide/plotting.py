@@ -250,7 +250,7 @@ def plot_reoptimised(
         if name not in states:
             raise ValueError(f"{name!r} is no state; there are {states}.")
         unit = (units or {}).get(name, "")
-        text = f"{symbol(name)} minus re-optimised" + (f" [{unit}]" if unit else "")
+        text = f"{symbol(name)} minus\nre-optimised" + (f" [{unit}]" if unit else "")
         panels.append((np.asarray(flights.t)[0], off[:, :, states.index(name)], text))
     return _cases(panels, labels, units)
 
