@@ -12,7 +12,14 @@ from jaxtyping import Array, Bool, Float
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, conjugate_ahead, solve_sweeps
 from jaxguide.nominal.conditions import endpoint_lagrangian
-from jaxguide.problem import Problem, bounds_of, hamiltonian, initial_values, is_free
+from jaxguide.problem import (
+    Problem,
+    bounds_of,
+    hamiltonian,
+    initial_values,
+    initially_free,
+    is_free,
+)
 from jaxguide.spectral import interpolation_matrix, nodes_lg, nodes_lgl
 from jaxguide.trajectory import Extremal
 
@@ -169,7 +176,7 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     miss = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
     labels = [f"constraint {i}" for i in range(e.shape[0])]
     rows.add("endpoint constraints", labels, miss[None], tf[None], 1e-9)
-    given, free = initial_values(problem, x.dtype)
+    given, free = initial_values(problem, x.dtype), initially_free(problem)
     g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))(
         problem, extremal.multipliers.endpoint, x0, xf, t0, tf
     )

@@ -50,7 +50,10 @@ class Outcome:
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point."""
-    sys.exit(run(sys.argv[1:] if argv is None else argv))
+    code = run(sys.argv[1:] if argv is None else argv)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # taking XLA's programs down one by one would take a second
 
 
 def run(argv: list[str]) -> int:

@@ -142,20 +142,22 @@ def hamiltonian(
     return problem.running_cost(t, x, u) + jnp.dot(costate, problem.dynamics(t, x, u))
 
 
-def initial_values(problem: Problem, dtype: Any) -> tuple[Float[Array, " n"], tuple[bool, ...]]:
-    """Initial state, free components at their guess (or 0), and which components are free."""
+def initially_free(problem: Problem) -> tuple[bool, ...]:
+    """Which components of the initial state are free."""
+    entries = problem.initial_state
+    if isinstance(entries, (tuple, list)):
+        return tuple(is_free(e) for e in entries)
+    return (entries is None or is_free(entries),) * problem.n
+
+
+def initial_values(problem: Problem, dtype: Any) -> Float[Array, " n"]:
+    """Initial state, free components at their guess (or 0)."""
     entries = problem.initial_state
     if entries is None:
-        entries = tuple(Free() for _ in range(problem.n))
-    if isinstance(entries, Free):
-        entries = tuple(
-            jax.tree_util.tree_map(lambda a, i=i: jnp.broadcast_to(a, (problem.n,))[i], entries)
-            for i in range(problem.n)
-        )
-    if not isinstance(entries, (tuple, list)):
-        return jnp.asarray(entries, dtype), (False,) * problem.n
-    values = [start_value(e) for e in entries]
-    return jnp.stack([jnp.asarray(v, dtype) for v in values]), tuple(is_free(e) for e in entries)
+        return jnp.zeros(problem.n, dtype)
+    if isinstance(entries, (tuple, list)):
+        return jnp.stack([jnp.asarray(start_value(e), dtype) for e in entries])
+    return jnp.broadcast_to(jnp.asarray(start_value(entries), dtype), (problem.n,))
 
 
 def start_value(entry: Any) -> Any:
@@ -187,6 +189,16 @@ def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
     finite = jnp.isfinite(lo) & jnp.isfinite(hi)
     middle = jnp.where(finite, (lo + hi) / 2, jnp.clip(jnp.zeros_like(lo), lo, hi))
     return middle + 0.1 * jnp.where(finite, (hi - lo) / 2, 1.0)
+
+
+@jax.jit
+def _start(problem: Problem) -> tuple[Array, ...]:
+    """Times, state, control and rate from which a search would start."""
+    dtype = jnp.result_type(float)
+    times = (problem.initial_time, problem.final_time)
+    t0, tf = (jnp.asarray(start_value(t), dtype) for t in times)
+    x0, u0 = initial_values(problem, dtype), start_control(problem, dtype)
+    return t0, tf, x0, u0, problem.dynamics(t0, x0, u0)
 
 
 def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: Any) -> tuple:
@@ -289,14 +301,15 @@ def validate(problem: Problem) -> None:
         ("integral_bounds", r),
     ):
         _check_bounds(problem, name, size)
-    x0, free = initial_values(problem, dtype)
+    t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
+    free = initially_free(problem)
     for i, name in enumerate(problem.state_names):
-        if not np.isfinite(np.asarray(x0)[i]):
+        if not np.isfinite(x0[i]):
             raise ValueError(
-                f"{kind}.initial_state: {name} is {float(x0[i])}; give a finite number"
+                f"{kind}.initial_state: {name} is {x0[i]}; give a finite number"
                 + (" as the guess of its jg.Free." if free[i] else " or jg.Free().")
             )
-    t0, tf = float(start_value(problem.initial_time)), float(start_value(problem.final_time))
+    t0, tf = float(t0), float(tf)
     if math.isnan(t0) or math.isnan(tf) or math.isinf(t0):
         raise ValueError(f"{kind}: initial_time is {t0} and final_time is {tf}; give numbers.")
     if not tf > t0 and not is_free(problem.final_time) and not is_free(problem.initial_time):
@@ -310,12 +323,10 @@ def validate(problem: Problem) -> None:
             f"{kind}: final_time is at most {float(latest)} and initial_time at least "
             f"{float(earliest)}; the horizon must be positive."
         )
-    u0 = start_control(problem, dtype)
-    rate = np.asarray(problem.dynamics(jnp.asarray(t0, dtype), x0, u0))
     if not np.all(np.isfinite(rate)) and not any(free):
         i = int(np.argmin(np.isfinite(rate)))
         raise ValueError(
             f"{kind}.dynamics: d({problem.state_names[i]})/dt is {rate[i]} at the start "
-            f"t={t0}, x={np.asarray(x0)}, u={np.asarray(u0)}; state bounds or a guess that keep "
+            f"t={t0}, x={x0}, u={u0}; state bounds or a guess that keep "
             "clear of the singularity, or mend the equation."
         )

@@ -15,7 +15,14 @@ import pytest
 from conftest import DoubleIntegrator
 
 import jaxguide as jg
-from jaxguide.problem import bounds_of, initial_values, start_value, validate, with_array_leaves
+from jaxguide.problem import (
+    bounds_of,
+    initial_values,
+    initially_free,
+    start_value,
+    validate,
+    with_array_leaves,
+)
 
 
 class Base(jg.Problem):
@@ -69,7 +76,7 @@ def test_vmap_reaches_them():
 
 def test_grad_reaches_them():
     def value(p):
-        x0, _ = initial_values(p, jnp.result_type(float))
+        x0 = initial_values(p, jnp.result_type(float))
         return p.final_time**2 + 5 * x0[1] + p.k**3
 
     p = with_array_leaves(dataclasses.replace(DoubleIntegrator(), final_time=3.0, k=2.0))
@@ -96,7 +103,7 @@ def test_arrays_and_lists_as_defaults(value):
     class Stated(Base):
         initial_state = value
 
-    got, free = initial_values(Stated(), jnp.result_type(float))
+    got, free = initial_values(Stated(), jnp.result_type(float)), initially_free(Stated())
     np.testing.assert_array_equal(got, [3.0, 4.0])
     assert free == (False, False)
     validate(Stated())
@@ -118,7 +125,7 @@ def test_free_as_a_class_attribute():
 
     p = Stated()
     assert isinstance(p.final_time, jg.Free) and p.final_time.hi == 4.0
-    x0, free = initial_values(p, jnp.result_type(float))
+    x0, free = initial_values(p, jnp.result_type(float)), initially_free(p)
     np.testing.assert_array_equal(x0, [1.0, 2.0])
     assert free == (False, True)
     assert 4.0 in jax.tree_util.tree_leaves(p)
@@ -185,7 +192,7 @@ def test_defaults_of_the_optional_methods():
 
 
 def test_all_initial_states_are_free_when_absent():
-    x0, free = initial_values(Base(), jnp.result_type(float))
+    x0, free = initial_values(Base(), jnp.result_type(float)), initially_free(Base())
     np.testing.assert_array_equal(x0, [0.0, 0.0])
     assert free == (True, True)
 

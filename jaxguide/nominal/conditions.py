@@ -7,7 +7,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.nominal.control import minimising_control
-from jaxguide.problem import Problem, bounds_of, hamiltonian, initial_values, is_free
+from jaxguide.problem import (
+    Problem,
+    bounds_of,
+    hamiltonian,
+    initial_values,
+    initially_free,
+    is_free,
+)
 
 
 class Unknowns(NamedTuple):
@@ -69,7 +76,7 @@ def boundary_residual(problem: Problem, z: Unknowns, ends: Float[Array, "arc two
     t0, tf = horizon(problem, z)
     x0, lam0 = z.starts[0, :n], z.starts[0, n:]
     xf, lamf = ends[-1, :n], ends[-1, n : 2 * n]
-    given, free = initial_values(problem, z.starts.dtype)
+    given, free = initial_values(problem, z.starts.dtype), initially_free(problem)
     g_x0, g_xf, g_t0, g_tf = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))(
         problem, z.nu, x0, xf, t0, tf
     )

@@ -16,7 +16,14 @@ from jaxguide.nominal.conditions import (
     horizon,
     number_of_constraints,
 )
-from jaxguide.problem import Problem, bounds_of, initial_values, is_free, start_value
+from jaxguide.problem import (
+    Problem,
+    bounds_of,
+    initial_values,
+    initially_free,
+    is_free,
+    start_value,
+)
 
 
 def rk4(rate: Any, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:
@@ -70,7 +77,7 @@ def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any
     half = jnp.where(finite, (hi - lo) / 2, 3.0)
     ends = jnp.clip(middle[None] + half[None] * r, lo[None], hi[None])
 
-    x0, free = initial_values(problem, dtype)
+    x0, free = initial_values(problem, dtype), initially_free(problem)
     scatter = jax.random.normal(k_x, (n,), dtype) * (1 + jnp.abs(x0)) * 0.5
     x0 = jnp.where(jnp.asarray(free), x0 + scatter, x0)
     t0 = jnp.asarray(start_value(problem.initial_time), dtype)

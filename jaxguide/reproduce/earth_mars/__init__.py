@@ -16,7 +16,11 @@ from jaxguide.problems import earth_mars
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
 from jaxguide.progress import NoProgress, Progress
 from jaxguide.reproduce.earth_mars import sections
-from jaxguide.reproduce.earth_mars.collocation import gain_errors, wrong_sign_histories
+from jaxguide.reproduce.earth_mars.collocation import (
+    gain_errors,
+    wrong_sign_histories,
+    wrong_sign_systems,
+)
 from jaxguide.reproduce.earth_mars.flights import (
     METHOD,
     fly_cases,
@@ -34,34 +38,33 @@ SWEEP_CASES = 10_000
 def run(out: Path | None = None, progress: Progress | None = None) -> Report:
     """Everything of the paper, with its figures in the folder `out` if there is one.
 
-    Most of the time goes into tracing and compiling, so few programs are made, each of one shape,
-    and what NumPy and LAPACK do runs beside, on another core.
+    Most of the time goes into tracing and compiling, so few programs are made, each of one shape.
+    What NumPy and LAPACK do runs beside, on another core; what JAX does stays in one thread, since
+    two that trace at once take turns at the interpreter, three times as long in all.
     """
     report = Report("Earth-Mars transfer: neighbouring optimal control (Yan, Fahroo & Ross 2002)")
     stages = Stages(report, NoProgress() if progress is None else progress, 4 + (out is not None))
-    with contextlib.closing(stages), ThreadPoolExecutor(2) as beside:
+    with contextlib.closing(stages), ThreadPoolExecutor(1) as beside:
         with stages("nominal"):
             extremal = solve(EarthMars(), METHOD)
         times = np.arange(round(float(extremal.final_time) / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
         instants = stage_times(times)
         with stages("gains"):
-            wrong = beside.submit(wrong_sign_histories, extremal, instants)
+            grids, systems = wrong_sign_systems(extremal, instants)
+            wrong = beside.submit(wrong_sign_histories, grids, systems, instants)
             exact = gain_schedule(extremal, times)
-            paper = beside.submit(gain_schedule, extremal, times, "least_squares", nodes=65)
-            of_paper = beside.submit(lambda: histories(paper.result(), instants))
-            of_exact = beside.submit(histories, exact, instants)
-            again = [beside.submit(reoptimise, case) for case in CASES]
-            errors = beside.submit(gain_errors, extremal)
+            paper = gain_schedule(extremal, times, "least_squares", nodes=65)
+            of_exact, of_paper = histories(exact, instants), histories(paper, instants)
+            errors = gain_errors(extremal)
         with stages("sweep"):
             mission = earth_mars.mission(extremal)
             dataset = sweep(mission, earth_mars.dispersions(), SWEEP_CASES, 0)
         with stages("six flights"):
-            maps = of_exact.result(), of_paper.result(), wrong.result()
-            flights = fly_cases(exact, instants, *maps)
-            reoptimised = [future.result() for future in again]
+            reoptimised = [reoptimise(case) for case in CASES]
+            flights = fly_cases(exact, instants, of_exact, of_paper, wrong.result())
         sections.nominal(report, extremal)
-        sections.gains(report, exact, paper.result())
-        sections.gain_errors(report, errors.result())
+        sections.gains(report, exact, paper)
+        sections.gain_errors(report, errors)
         sections.table_2(report, flights, reoptimised)
         sections.wrong_sign(report, flights, reoptimised)
         sections.dispersed(report, dataset)
@@ -69,7 +72,7 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
             from jaxguide.reproduce.earth_mars.figures import write_figures
 
             with stages("figures"):
-                shown = (extremal, exact, flights["lstsq64_interp"], reoptimised, errors.result())
+                shown = (extremal, exact, flights["lstsq64_interp"], reoptimised, errors)
                 report.figures = write_figures(out, *shown, dataset)
     return report
 

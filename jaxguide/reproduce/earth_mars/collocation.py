@@ -44,7 +44,7 @@ def at(extremal: Extremal, t: np.ndarray, sign: float = 1.0) -> tuple[Point, Sys
     parts = []
     for k in range(0, len(t), CHUNK):
         padded = np.pad(t[k : k + CHUNK], (0, max(0, k + CHUNK - len(t))), mode="edge")
-        parts.append(jax.device_get(_at(extremal, jnp.asarray(padded))))
+        parts.append(jax.device_get(_at(extremal, padded)))
     n = extremal.problem.n
     points = jax.tree_util.tree_map(
         lambda *a: np.concatenate(a)[: len(t)], *(point for point, _ in parts)
@@ -124,7 +124,7 @@ def segmented_gains(extremal: Extremal, tau: float) -> dict[int, np.ndarray]:
     """
     span = np.linspace(tau, float(extremal.final_time), 401)
     _, (M, U, psi) = at(extremal, span)
-    finest = np.asarray(_breaks(jnp.asarray(span), jnp.asarray(M), SEGMENTS[-1]))
+    finest = np.asarray(_breaks(span, M, SEGMENTS[-1]))
     stride = [SEGMENTS[-1] // s for s in SEGMENTS]
     fill = lambda b: np.pad(b, (0, len(finest) - len(b)), mode="edge")
     breaks = np.stack([fill(finest[::k]) for k in stride])
@@ -133,7 +133,7 @@ def segmented_gains(extremal: Extremal, tau: float) -> dict[int, np.ndarray]:
     t = breaks[:, None, :-1] + widths[:, None, :] * (nodes[None, :, None] + 1) / 2
     _, (M, _, _) = at(extremal, t.reshape(-1))
     M = M.reshape(*t.shape, *M.shape[1:]).transpose(0, 1, 3, 4, 2)
-    across = np.asarray(_across(jnp.asarray(M), jnp.asarray(widths)))
+    across = np.asarray(_across(M, widths))
     n, found = len(psi), {}
     for s, transitions in zip(SEGMENTS, across, strict=True):
         G = psi
@@ -152,19 +152,25 @@ def _across(M: Array, widths: Array) -> Float[Array, "size row column segment"]:
     return jax.vmap(lambda M, w: collocate(M, w, None, 12)[1])(M, widths)
 
 
-def wrong_sign_histories(extremal: Extremal, instants: np.ndarray) -> np.ndarray:
-    """Control histories of eq. (49) at the `instants` of every sample, from the first of each on,
-    with -H_uu in place of H_uu in eqs (16)-(21) and H_xx as it is."""
-    times = instants[:, 0]
-    nodes, half = nodes_lgl(WRONG_SIGN_NODES)[0], (float(extremal.final_time) - times) / 2
-    grids = times[:, None] + half[:, None] * (nodes[None, :] + 1)
+def wrong_sign_systems(extremal: Extremal, instants: np.ndarray) -> tuple[np.ndarray, System]:
+    """The points of every sample's horizon, and the linear TPBVP there with -H_uu in place of
+    H_uu in eqs (16)-(21) and H_xx as it is."""
+    times = instants[:, :1]
+    nodes = nodes_lgl(WRONG_SIGN_NODES)[0]
+    grids = times + (float(extremal.final_time) - times) / 2 * (nodes[None, :] + 1)
     _, (M, U, psi) = at(extremal, grids.reshape(-1), sign=-1.0)
     M, U = (a.reshape(*grids.shape, *a.shape[1:]) for a in (M, U))
-    degree = WRONG_SIGN_NODES - 1
-    to_coefficients = np.linalg.inv(legvander(nodes, degree))
+    return grids, System(M, U, psi)
+
+
+def wrong_sign_histories(grids: np.ndarray, systems: System, instants: np.ndarray) -> np.ndarray:
+    """Control histories of eq. (49) at the `instants` of every sample, from the first of each on."""
+    degree = grids.shape[1] - 1
+    to_coefficients = np.linalg.inv(legvander(nodes_lgl(degree + 1)[0], degree))
+    M, U, psi = systems
     found = []
     for k, grid in enumerate(grids):
         du = U[k] @ horizon(grid, System(M[k], U[k], psi))
-        basis = legvander((instants[k] - times[k]) / half[k] - 1, degree)
+        basis = legvander(2 * (instants[k] - grid[0]) / (grid[-1] - grid[0]) - 1, degree)
         found.append(np.tensordot(basis @ to_coefficients, du, 1))
     return np.stack(found)
