@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial.legendre import legval, legvander
@@ -60,7 +59,7 @@ def at(extremal: Extremal, t: np.ndarray, sign: float = 1.0) -> tuple[Point, Sys
 
 
 @eqx.filter_jit
-def _at(extremal: Extremal, t: Array) -> tuple[Point, LinearTPBVP]:
+def _at(extremal: Extremal, t: Any) -> tuple[Point, LinearTPBVP]:
     return extremal(t), linearize(extremal, t)
 
 
@@ -164,7 +163,7 @@ def wrong_sign_systems(extremal: Extremal, instants: np.ndarray) -> tuple[np.nda
 
 
 def wrong_sign_histories(grids: np.ndarray, systems: System, instants: np.ndarray) -> np.ndarray:
-    """Control histories of eq. (49) at the `instants` of every sample, from the first of each on."""
+    """Control histories of eq. (49) at the `instants` of every sample, the first included."""
     degree = grids.shape[1] - 1
     to_coefficients = np.linalg.inv(legvander(nodes_lgl(degree + 1)[0], degree))
     M, U, psi = systems

@@ -53,8 +53,8 @@ def histories(
 def fly_cases(
     schedule: GainSchedule,
     instants: Float[np.ndarray, "sample stage"],
-    of_exact: Float[np.ndarray, "sample stage m n"],
-    of_paper: Float[np.ndarray, "sample stage m n"],
+    of_exact: Float[Array, "sample stage m n"],
+    of_paper: Float[Array, "sample stage m n"],
     wrong: Float[np.ndarray, "sample stage m n"],
 ) -> dict[str, Flight]:
     """Variant -> the six flights of Table 1, batched, from histories at the `stage_times`.
@@ -69,21 +69,24 @@ def fly_cases(
     )
     samples, stages = instants.shape
     x, u = (a.reshape(samples, stages, -1) for a in at(extremal, instants.reshape(-1))[0][:2])
+    exact, paper = np.asarray(of_exact), np.asarray(of_paper)
     held = lambda a: np.broadcast_to(a[:, :1], a.shape)
     variants = {  # nominal and deviation at the stages
-        "lstsq64_interp": (u, of_paper),
-        "lstsq64_zoh_du": (u, held(of_paper)),
-        "lstsq64_zoh_u": (held(u), held(of_paper)),
-        "exact_interp": (u, of_exact),
+        "lstsq64_interp": (u, paper),
+        "lstsq64_zoh_du": (u, held(paper)),
+        "lstsq64_zoh_u": (held(u), held(paper)),
+        "exact_interp": (u, exact),
         "wrong sign": (u, wrong),
     }
     inside, cap = np.ones(samples, bool), np.full(samples, np.inf)
     leaves = [(x[:, 0], maps[:, 0], u, maps, cap, inside) for u, maps in variants.values()]
-    laws = PreparedNeighboring(*(np.stack(a) for a in zip(*leaves, strict=True)))
-    prepared = Prepared(
-        np.append(instants[:, 0], instants[-1, -1]), SampleGrid(instants[:, 0], instants), laws
-    )
-    flights = jax.device_get(_fly(mission, prepared, np.asarray(CASES)))
+    stacked = [np.stack(a) for a in zip(*leaves, strict=True)]
+    times = np.append(instants[:, 0], instants[-1, -1])
+    host = (stacked, times, instants[:, 0], instants, np.asarray(CASES))
+    stacked, times, begins, within, cases = jax.device_put(host)
+    grid = SampleGrid(begins, within)
+    flights = _fly(mission, Prepared(times, grid, PreparedNeighboring(*stacked)), cases)
+    flights = jax.device_get(flights)
     pick = lambda k: jax.tree_util.tree_map(lambda a: a[k], flights)
     return {name: pick(k) for k, name in enumerate(variants)}
 
