@@ -41,7 +41,7 @@ def stage_times(times: np.ndarray) -> Float[np.ndarray, "sample stage"]:
 
 @eqx.filter_jit
 def histories(
-    schedule: GainSchedule, instants: Float[np.ndarray, "sample stage"]
+    schedule: GainSchedule, instants: Float[Array | np.ndarray, "sample stage"]
 ) -> Float[Array, "sample stage m n"]:
     """The schedule's own open-loop control at the `instants`, per deviation at each sample."""
     # One `vmap` over all: two, nested, take twice as long to trace.
