@@ -62,15 +62,23 @@ class Trajectory(eqx.Module):
     def interpolate(self, values: Float[Array, "node *k"], t: Any) -> Array:
         """`values` at the nodes, interpolated at the scalar `t`; held beyond the ends."""
         p = self.reference_nodes.shape[0]
+        return self._at(lambda s: jax.lax.dynamic_slice_in_dim(values, s * (p - 1), p), t)
+
+    def _interpolate(self, parts: Float[Array, "segment p k"], t: Any) -> Array:
+        """As `interpolate`, of values that may jump at the breaks."""
+        return self._at(lambda s: parts[s], t)
+
+    def _at(self, pick: Callable, t: Any) -> Array:
         t = jnp.clip(jnp.asarray(t, self.t.dtype), self.t[0], self.t[-1])
         breaks = self.breaks
         last = breaks.shape[0] - 2
         s = jnp.clip(jnp.searchsorted(breaks, t, side="right") - 1, 0, last)
-        local = jax.lax.dynamic_slice_in_dim(values, s * (p - 1), p)
-        a, b = breaks[s], breaks[s + 1]
-        width = jnp.where(b > a, b - a, 1.0)
-        tau = (2 * t - a - b) / width
-        return interpolate(self.reference_nodes, local, tau)
+        return interpolate(self.reference_nodes, pick(s), self._local(t, s))
+
+    def _local(self, t: Array, s: Array) -> Array:
+        """tau of `t` in segment `s`."""
+        a, b = self.breaks[s], self.breaks[s + 1]
+        return (2 * t - a - b) / jnp.where(b > a, b - a, 1.0)
 
 
 class Extremal(Trajectory):
@@ -89,6 +97,21 @@ class Extremal(Trajectory):
     residual: Float[Array, ""]
     problem: Problem
     certifier: Callable = eqx.field(static=True)
+    # Control and costate may jump at a break: `u` and `costate` hold what follows it.
+    u_before: Float[Array, "segment m"] | None = None
+    costate_before: Float[Array, "segment n"] | None = None
+
+    def control_by_segment(self) -> Float[Array, "segment p m"]:
+        """Nodal controls segment by segment, each with its own end."""
+        return self._own_ends(self.u, self.u_before)
+
+    def costate_by_segment(self) -> Float[Array, "segment p n"]:
+        """Nodal costates segment by segment, each with its own end."""
+        return self._own_ends(self.costate, self.costate_before)
+
+    def _own_ends(self, values: Array, before: Array | None) -> Array:
+        parts = self.by_segment(values)
+        return parts if before is None else parts.at[:, -1].set(before)
 
     @property
     def certificate(self) -> Any:
@@ -107,7 +130,11 @@ class Extremal(Trajectory):
     def point(self, t: Any) -> Point:
         """The interpolant at the scalar `t`, its control as interpolated."""
         n, m = self.problem.n, self.problem.m
-        y = self.interpolate(jnp.concatenate([self.x, self.u, self.costate], axis=1), t)
+        if self.u_before is None:
+            y = self.interpolate(jnp.concatenate([self.x, self.u, self.costate], axis=1), t)
+        else:
+            parts = (self.by_segment(self.x), self.control_by_segment(), self.costate_by_segment())
+            y = self._interpolate(jnp.concatenate(parts, axis=2), t)
         return Point(y[:n], y[n : n + m], y[n + m :])
 
 

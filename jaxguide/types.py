@@ -26,6 +26,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The boundary conditions were not met: the shooting iterations stalled. Pass a `guess` "
         "(an Extremal or costates), raise `starts` or `arcs`, or check that the end is reachable."
     )
+    optimiser_stopped = (
+        "The interior-point iterations ended before the first-order conditions were met: raise "
+        "`max_iterations`, change the mesh, give bounds or a `guess`, or look for a discontinuity "
+        "in the dynamics."
+    )
     infeasible = (
         "No trajectory meets the endpoint constraints: relax a constraint or a bound, or free a "
         "component of the initial state or the final time."

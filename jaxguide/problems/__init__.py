@@ -10,7 +10,39 @@ if TYPE_CHECKING:
     from jaxguide.problem import Problem
 
 # name -> (module, Problem class); a module may also offer `mission` and `dispersions`.
-_LIBRARY = {"earth-mars": ("earth_mars", "EarthMars")}
+_LIBRARY = {
+    "earth-mars": ("earth_mars", "EarthMars"),
+    "double-integrator": ("linear_quadratic", "DoubleIntegratorEffort"),
+    "free-end-velocity": ("linear_quadratic", "FreeEndVelocity"),
+    "bryson-denham": ("linear_quadratic", "BrysonDenham"),
+    "beam": ("linear_quadratic", "Beam"),
+    "scalar-regulator": ("linear_quadratic", "ScalarRegulator"),
+    "weighted-regulator": ("linear_quadratic", "WeightedRegulator"),
+    "two-thrusters": ("linear_quadratic", "TwoThrusters"),
+    "robbins": ("linear_quadratic", "Robbins"),
+    "brachistochrone": ("steering", "Brachistochrone"),
+    "brachistochrone-dymos": ("steering", "BrachistochroneDymos"),
+    "brachistochrone-wall": ("steering", "BrachistochroneWall"),
+    "linear-tangent-steering": ("steering", "LinearTangentSteering"),
+    "hanging-chain": ("steering", "HangingChain"),
+    "isoperimetric": ("steering", "Isoperimetric"),
+    "hypersensitive": ("oscillators", "Hypersensitive"),
+    "rayleigh": ("oscillators", "Rayleigh"),
+    "van-der-pol": ("oscillators", "VanDerPol"),
+    "fuller": ("oscillators", "Fuller"),
+    "singular5": ("oscillators", "Singular5"),
+    "catalyst-mixing": ("reactors", "CatalystMixing"),
+    "jackson": ("reactors", "Jackson"),
+    "tumour": ("reactors", "Tumour"),
+    "moon-lander": ("vehicles", "MoonLander"),
+    "goddard": ("vehicles", "Goddard"),
+    "goddard-speed-limit": ("vehicles", "GoddardSpeedLimit"),
+    "robot-arm": ("vehicles", "RobotArm"),
+    "free-flying-robot": ("vehicles", "FreeFlyingRobot"),
+    "hang-glider": ("vehicles", "HangGlider"),
+    "shuttle-reentry": ("shuttle", "ShuttleReentry"),
+    "shuttle-reentry-heat": ("shuttle", "ShuttleReentryHeat"),
+}
 
 
 def names() -> tuple[str, ...]:

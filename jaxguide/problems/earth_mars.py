@@ -11,6 +11,7 @@ from jaxguide.laws.neighboring import NeighboringOptimal
 from jaxguide.montecarlo.dispersions import Distribution, Normal
 from jaxguide.neighboring.gains import gain_schedule
 from jaxguide.problem import Problem
+from jaxguide.problems.reference import Reference
 from jaxguide.solving import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.trig import sincos
@@ -34,6 +35,9 @@ class EarthMars(Problem):
     initial_time = 0.0
     final_time = 3.32
     initial_state = (1.0, 0.0, 1.0)
+    reference = Reference(
+        -1.525277700649, 1e-11, "independent, two meshes", "Bryson & Ho (1975); yapss orbit_raising"
+    )
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         r, v_r, v_t = x[0], x[1], x[2]

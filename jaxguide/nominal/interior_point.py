@@ -1,0 +1,440 @@
+"""A primal-dual interior-point method for transcriptions, in fixed shapes: one program a mesh.
+
+Newton's method on the perturbed conditions with inertia correction, a filter line search with
+second-order correction, and feasibility restoration by least-distance Newton steps. One loop body
+serves every kind of step, so that the factorisation is compiled once.
+
+**Source:** Waechter & Biegler, Math. Program. 106 (2006); equation numbers below are theirs.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxguide.nominal import kkt
+from jaxguide.nominal.transcription import (
+    Bounds,
+    Dual,
+    Ends,
+    Nodes,
+    Primal,
+    Residual,
+    Transcription,
+)
+
+_tree = jax.tree_util.tree_map
+
+# Constants of the paper, section 3.
+_KAPPA_EPS, _KAPPA_MU, _THETA_MU, _TAU_MIN = 10.0, 0.2, 1.5, 0.99
+_KAPPA_SIGMA, _KAPPA_D, _S_MAX = 1e10, 1e-5, 100.0
+_GAMMA, _DELTA, _S_THETA, _S_PHI, _ETA = 1e-5, 1.0, 1.1, 2.3, 1e-4
+_DELTA_FIRST, _DELTA_MAX = 1e-4, 1e20
+_HALVINGS, _FILTER = 30, 128
+_MULTIPLIERS_MAX = 1e3  # of the first estimate; a larger one is worth less than none
+
+# Kinds of pass through the loop.
+_NEWTON, _CORRECT, _RESTORE, _ESTIMATE = 0, 1, 2, 3
+RUNNING, CONVERGED, INFEASIBLE, TOO_MANY, STALLED = 0, 1, 2, 3, 4
+
+
+class Options(NamedTuple):
+    """Runtime arguments: changing them compiles nothing."""
+
+    tolerance: Any = 1e-9
+    mu: Any = 0.1
+    max_iterations: Any = 300
+
+
+class Solution(NamedTuple):
+    """Where the iterations ended."""
+
+    w: Primal
+    y: Dual
+    zl: Primal
+    zu: Primal
+    mu: Float[Array, ""]
+    status: Int[Array, ""]
+    iterations: Int[Array, ""]
+    error: Float[Array, ""]
+    violation: Float[Array, ""]
+
+
+class _Filter(NamedTuple):
+    theta: Float[Array, " slot"]
+    phi: Float[Array, " slot"]
+    used: Int[Array, ""]
+
+
+class _State(NamedTuple):
+    w: Primal
+    y: Dual
+    zl: Primal
+    zu: Primal
+    mu: Array
+    filter: _Filter
+    theta_max: Array
+    theta_min: Array
+    theta_entry: Array  # violation at which restoration began
+    delta: Array  # last regularisation that was needed
+    mode: Array
+    saved: kkt.Step  # the step whose correction is sought
+    corrected: Residual  # the residual it is sought for
+    alpha: Array
+    k: Array
+    status: Array
+    error: Array
+    log: Float[Array, "row entry"]
+
+
+class _Box(NamedTuple):
+    """Bounds with what follows from them."""
+
+    lo: Primal
+    hi: Primal
+    below: Primal  # bool: has a lower bound and may move
+    above: Primal
+    given: Primal
+
+
+def boxed(bounds: Bounds) -> _Box:
+    """Nodes between bounds that (nearly) coincide get a little room; other such entries are given."""
+    lo, hi = bounds
+    room = lambda a, b: 1e-8 * jnp.maximum(1.0, jnp.abs(a)) * (b - a < 1e-8)
+    widen = lambda a, b: (a - room(a, b), b + room(a, b))
+    (xl, xu), (ul, uu) = widen(lo.x, hi.x), widen(lo.u, hi.u)
+    lo, hi = lo._replace(x=xl, u=ul), hi._replace(x=xu, u=uu)
+    given = _tree(lambda a, b: a >= b, lo, hi)
+    below = _tree(lambda a, g: jnp.isfinite(a) & ~g, lo, given)
+    above = _tree(lambda b, g: jnp.isfinite(b) & ~g, hi, given)
+    return _Box(lo, hi, below, above, given)
+
+
+def inside(box: _Box, w: Primal, push: float = 1e-2) -> Primal:
+    """`w` moved well within its bounds, given entries put where they belong (section 3.6)."""
+
+    def one(w: Array, lo: Array, hi: Array, below: Array, above: Array, given: Array) -> Array:
+        width = jnp.where(below & above, hi - lo, jnp.inf)
+        step = lambda b: jnp.minimum(push * jnp.maximum(1.0, jnp.abs(b)), push * width)
+        w = jnp.where(below, jnp.maximum(w, lo + step(jnp.where(below, lo, 0.0))), w)
+        w = jnp.where(above, jnp.minimum(w, hi - step(jnp.where(above, hi, 0.0))), w)
+        return jnp.where(given, lo, w)
+
+    return _tree(one, w, box.lo, box.hi, box.below, box.above, box.given)
+
+
+def _gaps(box: _Box, w: Primal) -> tuple[Primal, Primal]:
+    """Distances to the bounds, 1 where there is none."""
+    low = _tree(
+        lambda w, b, on: jnp.where(on, w - jnp.where(on, b, 0.0), 1.0), w, box.lo, box.below
+    )
+    high = _tree(
+        lambda w, b, on: jnp.where(on, jnp.where(on, b, 0.0) - w, 1.0), w, box.hi, box.above
+    )
+    return low, high
+
+
+def _total(tree: Any) -> Array:
+    return sum((jnp.sum(a) for a in jax.tree_util.tree_leaves(tree)), jnp.zeros(()))
+
+
+def _largest(tree: Any) -> Array:
+    leaves = [jnp.max(jnp.abs(a), initial=0.0) for a in jax.tree_util.tree_leaves(tree)]
+    return jnp.max(jnp.stack(leaves))
+
+
+def _finite(tree: Any) -> Array:
+    return jnp.isfinite(_total(_tree(jnp.abs, tree)))
+
+
+def _norm1(c: Residual) -> Array:
+    return _total(_tree(jnp.abs, c))
+
+
+def _count(tree: Any) -> int:
+    return sum(a.size for a in jax.tree_util.tree_leaves(tree))
+
+
+def _barrier(box: _Box, w: Primal, mu: Array) -> Array:
+    """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
+    low, high = _gaps(box, w)
+    inside = lambda a: jnp.where(a > 0, a, jnp.nan)
+    logs = _total(_tree(lambda a, b: jnp.log(inside(a)) + jnp.log(inside(b)), low, high))
+    one = lambda a, b, l, h: _KAPPA_D * (jnp.where(l & ~h, a, 0.0) + jnp.where(h & ~l, b, 0.0))
+    return mu * (_total(_tree(one, low, high, box.below, box.above)) - logs)
+
+
+def _pull(box: _Box, low: Primal, high: Primal, mu: Array) -> Primal:
+    """Gradient of `_barrier`."""
+
+    def one(a: Array, b: Array, l: Array, h: Array) -> Array:
+        lower = jnp.where(l, -1 / a + jnp.where(h, 0.0, _KAPPA_D), 0.0)
+        upper = jnp.where(h, 1 / b - jnp.where(l, 0.0, _KAPPA_D), 0.0)
+        return mu * (lower + upper)
+
+    return _tree(one, low, high, box.below, box.above)
+
+
+def _longest(gap_low: Primal, gap_high: Primal, dw: Primal, box: _Box, tau: Array) -> Array:
+    """The longest step, up to 1, that keeps the fraction 1 - tau of each distance (eq. 15a)."""
+
+    def one(a: Array, b: Array, d: Array, l: Array, h: Array) -> Array:
+        low = jnp.where(l & (d < 0), -tau * a / jnp.where(d < 0, d, -1.0), jnp.inf)
+        high = jnp.where(h & (d > 0), tau * b / jnp.where(d > 0, d, 1.0), jnp.inf)
+        return jnp.min(jnp.minimum(low, high), initial=1.0)
+
+    steps = jax.tree_util.tree_leaves(_tree(one, gap_low, gap_high, dw, box.below, box.above))
+    return jnp.min(jnp.stack(steps))
+
+
+def _longest_dual(z: Primal, dz: Primal, tau: Array) -> Array:
+    one = lambda z, d: jnp.min(
+        jnp.where(d < 0, -tau * z / jnp.where(d < 0, d, -1.0), jnp.inf), initial=1.0
+    )
+    return jnp.min(jnp.stack(jax.tree_util.tree_leaves(_tree(one, z, dz))))
+
+
+def _where(condition: Array, a: Any, b: Any) -> Any:
+    return _tree(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+def _move(a: Any, alpha: Array, d: Any) -> Any:
+    return _tree(lambda x, y: x + alpha * y, a, d)
+
+
+def _acceptable(filter: _Filter, theta: Array, phi: Array) -> Array:
+    """Whether (theta, phi) is not dominated by the filter (eq. 18)."""
+    better = (theta < filter.theta) | (phi < filter.phi)
+    live = jnp.arange(_FILTER) < filter.used
+    return jnp.all(better | ~live)
+
+
+def _augment(filter: _Filter, theta: Array, phi: Array, add: Array) -> _Filter:
+    at = filter.used % _FILTER
+    new = _Filter(
+        filter.theta.at[at].set((1 - _GAMMA) * theta),
+        filter.phi.at[at].set(phi - _GAMMA * theta),
+        filter.used + 1,
+    )
+    return _where(add, new, filter)
+
+
+def optimality_error(
+    program: Transcription, box: _Box, w: Primal, y: Dual, zl: Primal, zu: Primal, c: Residual,
+    mu: Array,
+) -> Array:  # fmt: skip
+    """E_mu of eq. (5): the worst scaled violation of the perturbed conditions."""
+
+    def lagrangian(w: Primal) -> Array:
+        f, c = program.objective_and_residual(w)
+        return f + _total(_tree(lambda a, b: a * b, y, Dual(*c)))
+
+    gradient = _tree(lambda g, a, b: g - a + b, jax.grad(lagrangian)(w), zl, zu)
+    gradient = _tree(lambda g, given: jnp.where(given, 0.0, g), gradient, box.given)
+    low, high = _gaps(box, w)
+    z = _total(zl) + _total(zu)
+    duals = _total(_tree(jnp.abs, y)) + z
+    s_d = jnp.maximum(_S_MAX, duals / (_count(y) + 2 * _count(w))) / _S_MAX
+    s_c = jnp.maximum(_S_MAX, z / (2 * _count(w))) / _S_MAX
+    short = lambda a, z, on: jnp.where(on, a * z - mu, 0.0)
+    gap = jnp.maximum(
+        _largest(_tree(short, low, zl, box.below)), _largest(_tree(short, high, zu, box.above))
+    )
+    return jnp.maximum(jnp.maximum(_largest(gradient) / s_d, _largest(c)), gap / s_c)
+
+
+def minimise(
+    program: Transcription, bounds: Bounds, start: Primal, options: Options
+) -> tuple[Solution, Float[Array, "row entry"]]:
+    """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
+    box = boxed(bounds)
+    dtype = program.fractions.dtype
+    w = inside(box, start)
+    mu = jnp.asarray(options.mu, dtype)
+    low, high = _gaps(box, w)
+    zl = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), low, box.below)
+    zu = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), high, box.above)
+    _, c = program.objective_and_residual(w)
+    theta = _norm1(c)
+    zero, nought = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    y = Dual(*_tree(jnp.zeros_like, c))
+    slots = jnp.full(_FILTER, -jnp.inf, dtype)
+    state = _State(
+        w, y, zl, zu, mu,
+        _Filter(slots, slots, nought),
+        1e4 * jnp.maximum(1.0, theta), 1e-4 * jnp.maximum(1.0, theta), theta,
+        zero, nought + _ESTIMATE,
+        kkt.Step(_tree(jnp.zeros_like, w), y), c, zero, nought, nought + RUNNING, zero + jnp.inf,
+        jnp.zeros((0, 0), dtype),
+    )  # fmt: skip
+    body = lambda s: _pass(program, box, options, s)
+    end = jax.lax.while_loop(lambda s: s.status == RUNNING, body, state)
+    _, c = program.objective_and_residual(end.w)
+    return Solution(
+        end.w, end.y, end.zl, end.zu, end.mu, end.status, end.k, end.error, _largest(c)
+    ), end.log
+
+
+def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
+    """One step of any kind."""
+    n = program.sizes.n
+    newton, correct = s.mode == _NEWTON, s.mode == _CORRECT
+    restore, estimate = s.mode == _RESTORE, s.mode == _ESTIMATE
+    nodes, ends = program.derivatives(s.w)
+    f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
+    low, high = _gaps(box, s.w)
+    error = lambda mu: optimality_error(program, box, s.w, s.y, s.zl, s.zu, c, mu)
+    error_now = error(jnp.zeros_like(s.mu))
+    done = newton & (error_now <= options.tolerance)
+
+    # Barrier: lowered while the current problem is solved to its own size (eq. 7).
+    least = options.tolerance / 10
+    lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
+    ready = lambda mu: newton & (error(mu) <= _KAPPA_EPS * mu) & (mu > least)
+    mu = jax.lax.while_loop(ready, lower, s.mu)
+    filter = s.filter._replace(used=jnp.where(mu < s.mu, 0, s.filter.used))
+    tau = jnp.maximum(_TAU_MIN, 1 - mu)
+
+    # The system of this kind of step.
+    H, H_end = program.hessians(s.w, s.y)
+    flat = restore | estimate
+    H, H_end = _where(flat, _tree(jnp.zeros_like, (H, H_end)), (H, H_end))
+    J = jnp.where(restore, nodes.jacobian.at[:, :, n].set(0.0), nodes.jacobian)
+    J_end = jnp.where(restore, ends.jacobian.at[0].set(0.0), ends.jacobian)
+    sigma = _tree(lambda z, a, u, b: z / a + u / b, s.zl, low, s.zu, high)
+    ones, zeros = _tree(jnp.ones_like, sigma), _tree(jnp.zeros_like, sigma)
+    slack_only = zeros._replace(path=ones.path, end=ones.end)
+    sigma = _where(estimate, slack_only, sigma)
+    pull = _where(estimate, _tree(lambda a, b: b - a, s.zl, s.zu), _pull(box, low, high, mu))
+    c_used = _where(correct, s.corrected, _where(estimate, _tree(jnp.zeros_like, c), c))
+    y_used = _where(flat, _tree(jnp.zeros_like, s.y), s.y)
+    system = kkt.System(
+        Nodes(nodes.value, J), Ends(ends.value, J_end), H, H_end, c_used, sigma, pull, y_used,
+        box.given,
+    )  # fmt: skip
+    segments = kkt.eliminate(program, system)
+    rho = 1e2 * (1 + _largest(H))
+
+    # Regularised until the inertia is right (algorithm IC).
+    first = jnp.where(estimate, 1.0, jnp.where(restore, jnp.sqrt(mu), 0.0))
+
+    def attempt(carry: tuple) -> tuple:
+        delta, _, _, tries = carry
+        step, ok = kkt.solve(program, system, segments, delta, rho)
+        ok = ok & _finite(step)
+        again = jnp.where(s.delta > 0, jnp.maximum(1e-20, s.delta / 3), _DELTA_FIRST)
+        grow = jnp.where(s.delta > 0, 8.0, 100.0)
+        following = jnp.where(delta > first, delta * grow, jnp.maximum(again, 8 * delta))
+        return jnp.where(ok, delta, following), step, ok, tries + 1
+
+    blank = kkt.Step(zeros, _tree(jnp.zeros_like, s.y))
+    delta, step, regular, _ = jax.lax.while_loop(
+        lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False), 0)
+    )
+    delta_last = jnp.where(regular & ~flat & (delta > 0), delta, s.delta)
+    dw = step.primal
+
+    # The line search: the full step first, then, if that fails, halves of the uncorrected one.
+    phi_of = lambda f, w: f + _barrier(box, w, mu)
+    theta, phi = _norm1(c), phi_of(f, s.w)
+    along = _where(correct, s.saved.primal, dw)
+    longest = _longest(low, high, dw, box, tau)
+    slope = _slope(program, nodes, ends, along, _pull(box, low, high, mu))
+
+    def judge(alpha: Array, d: Primal) -> tuple[Array, Array, Residual, Array]:
+        w = _move(s.w, alpha, d)
+        f, c = program.objective_and_residual(w)
+        theta_new, phi_new = _norm1(c), phi_of(f, w)
+        sane = jnp.isfinite(theta_new) & jnp.isfinite(phi_new) & (theta_new <= s.theta_max)
+        falling = slope < 0
+        steep = jnp.where(falling, -slope, 0.0)
+        switch = falling & (alpha * steep**_S_PHI > _DELTA * theta**_S_THETA)
+        f_type = switch & (theta <= s.theta_min)
+        slack = 1e2 * jnp.finfo(phi.dtype).eps * (1 + jnp.abs(phi))
+        armijo = phi_new <= phi + _ETA * alpha * slope + slack
+        progress = (theta_new <= (1 - _GAMMA) * theta) | (phi_new <= phi - _GAMMA * theta + slack)
+        good = jnp.where(f_type, armijo, progress) & _acceptable(filter, theta_new, phi_new)
+        nearer = theta_new <= (1 - 1e-4 * alpha) * theta
+        return sane & jnp.where(restore, nearer, good), f_type & armijo, c, theta_new
+
+    full, f_type, c_new, theta_new = judge(longest, dw)
+    try_correction = newton & ~full & (theta_new >= theta) & jnp.isfinite(theta_new)
+
+    def shorten(carry: tuple) -> tuple:
+        alpha, _, _, k = carry
+        alpha = alpha / 2
+        ok, f_type, _, _ = judge(alpha, along)
+        return alpha, ok, f_type, k + 1
+
+    begin = jnp.where(correct, s.alpha, longest)
+    short, found, short_f_type, _ = jax.lax.while_loop(
+        lambda a: ~a[1] & (a[3] < _HALVINGS) & regular,
+        shorten,
+        (begin, full | try_correction | estimate | done, f_type, 0),
+    )
+    accepted = regular & found & ~try_correction & ~estimate & ~done
+    alpha = jnp.where(full, longest, short)
+    d = _where(full, dw, along)
+    dual = _where(full | ~correct, step.dual, s.saved.dual)
+    f_type = jnp.where(full, f_type, short_f_type)
+
+    # Move.
+    rate = lambda z, a, dw, on, sign: jnp.where(on, mu / a - z - sign * z / a * dw, 0.0)
+    dzl = _tree(lambda z, a, d, on: rate(z, a, d, on, 1.0), s.zl, low, d, box.below)
+    dzu = _tree(lambda z, a, d, on: rate(z, a, d, on, -1.0), s.zu, high, d, box.above)
+    alpha_z = jnp.minimum(_longest_dual(s.zl, dzl, tau), _longest_dual(s.zu, dzu, tau))
+    w = _move(s.w, alpha, d)
+    low, high = _gaps(box, w)
+    keep = lambda z, a, on: jnp.where(
+        on, jnp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
+    )
+    zl = _tree(keep, _move(s.zl, alpha_z, dzl), low, box.below)
+    zu = _tree(keep, _move(s.zu, alpha_z, dzu), high, box.above)
+    y = _tree(lambda a, b: a + alpha * (b - a), s.y, dual)
+
+    modest = _finite(step.dual) & (_largest(step.dual) <= _MULTIPLIERS_MAX) & regular
+    y_estimate = _where(modest, step.dual, _tree(jnp.zeros_like, s.y))
+    y = _where(restore, s.y, y)
+    new_w = _where(accepted, w, s.w)
+    new_y = _where(estimate, y_estimate, _where(accepted, y, s.y))
+    new_zl, new_zu = _where(accepted, (zl, zu), (s.zl, s.zu))
+
+    # What comes next.
+    f_at, c_at = program.objective_and_residual(new_w)
+    theta_at = _norm1(c_at)
+    home = accepted & restore & (theta_at <= 0.9 * s.theta_entry)
+    home = home & _acceptable(filter, theta_at, phi_of(f_at, new_w))
+    solved = accepted & restore & (_largest(c_at) <= options.tolerance / 10)
+    failed = ~accepted & ~try_correction & ~estimate & ~done
+    into = failed & (newton | correct)
+    stuck = failed & restore
+    feasible = _largest(c) <= jnp.maximum(1e-8, options.tolerance)
+    mode = jnp.where(restore & ~(home | solved), _RESTORE, _NEWTON)
+    mode = jnp.where(home | solved, _ESTIMATE, mode)
+    mode = jnp.where(try_correction, _CORRECT, mode)
+    mode = jnp.where(into, _RESTORE, mode)
+    add = (accepted & (newton | correct) & ~f_type) | into
+    filter = _augment(filter, theta, phi, add)
+    status = jnp.where(done, CONVERGED, RUNNING)
+    status = jnp.where(stuck, jnp.where(feasible, STALLED, INFEASIBLE), status)
+    status = jnp.where(into & feasible, STALLED, status)
+    status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)
+    corrected = _tree(lambda a, b: longest * a + b, c, c_new)
+    return _State(
+        new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
+        jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
+        step, corrected, longest, s.k + 1, status.astype(s.status.dtype), error_now, s.log,
+    )  # fmt: skip
+
+
+def _slope(
+    program: Transcription, nodes: Nodes, ends: Ends, d: Primal, pull: Primal
+) -> Float[Array, ""]:
+    """Directional derivative of the barrier objective."""
+    n = program.sizes.n
+    dq = program.inputs(d)
+    objective = jnp.sum(nodes.jacobian[:, :, n] * dq)
+    objective = objective + jnp.dot(ends.jacobian[0], program.end_inputs(d))
+    return objective + _total(_tree(lambda a, b: a * b, pull, d))

@@ -1,0 +1,348 @@
+"""`jg.Pseudospectral`: Problem P solved directly on a mesh, costates by covector mapping.
+
+**Source:** Ross & Karpenko, review (2012), sections 3 and 4.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import solve as small_solve
+from jaxguide.nominal import interior_point
+from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
+from jaxguide.nominal.transcription import (
+    Bounds,
+    Primal,
+    Scale,
+    Transcription,
+    bounds,
+    constraint_counts,
+    node_times,
+    parameters,
+    with_integrals,
+    with_parameters,
+)
+from jaxguide.problem import (
+    Problem,
+    bounds_of,
+    initial_values,
+    is_free,
+    start_control,
+    start_value,
+)
+from jaxguide.trajectory import Extremal, Multipliers
+from jaxguide.types import RESULTS
+
+
+class Pseudospectral(eqx.Module):
+    """Direct collocation on one or many segments, solved by the interior-point method.
+
+    **Arguments:**
+
+    - `grid`: "lgl" (the review's choice for finite horizons), "cgl", "lgr-left", "lgr-right", "lg".
+    - `nodes`: collocation nodes a segment. `segments`: of equal length, unless `fractions`
+      (segments + 1,), from 0 to 1, places their ends.
+    - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
+
+    **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
+
+    **Source:** review, eqs (10)-(16), (21), (23); Waechter & Biegler (2006).
+    """
+
+    grid: str = eqx.field(static=True, default="lgl")
+    nodes: int = eqx.field(static=True, default=16)
+    segments: int = eqx.field(static=True, default=4)
+    fractions: Any = None
+    tolerance: float = eqx.field(static=True, default=1e-9)
+    max_iterations: int = eqx.field(static=True, default=500)
+
+    def __check_init__(self):
+        if self.grid not in FAMILIES:
+            raise ValueError(
+                f"Pseudospectral: grid is {self.grid!r}; choose one of {', '.join(FAMILIES)}."
+            )
+        if self.segments < 1:
+            raise ValueError(f"Pseudospectral: segments is {self.segments}; give at least 1.")
+        if self.max_iterations < 1:
+            raise ValueError(f"Pseudospectral: max_iterations is {self.max_iterations}.")
+        if not 0 < self.tolerance < 1:
+            raise ValueError(f"Pseudospectral: tolerance is {self.tolerance}; give one in (0, 1).")
+        collocation(self.grid, self.nodes)
+
+    def check_fields(self, problem: Problem) -> None:
+        """Nothing that a Problem may hold is beyond it. Host only."""
+
+    def check(self, problem: Problem) -> None:
+        """Refuses an infinite horizon, which needs its own map. Host only."""
+        tf = problem.final_time
+        if not is_free(tf) and np.any(np.isinf(np.asarray(tf))):
+            raise ValueError(
+                f"{type(problem).__name__}.final_time is infinite; give a finite one (some ten "
+                "time constants)."
+            )
+
+    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
+        """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
+        program, start = self.prepared(problem, guess)
+        options = interior_point.Options(self.tolerance, 0.1, self.max_iterations)
+        box = bounds(program)
+        solution, _ = interior_point.minimise(program, box, start, options)
+        return to_extremal(problem, program, box, solution, certifier)
+
+    def prepared(self, problem: Problem, guess: Any) -> tuple[Transcription, Primal]:
+        """The transcription in designer units, and where the search starts."""
+        dtype = jnp.result_type(float)
+        whole = with_integrals(problem)
+        if self.fractions is None:
+            fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
+        else:
+            fractions = jnp.asarray(self.fractions, dtype)
+        unit = unit_scale(whole)
+        program = Transcription(whole, unit, fractions, self.grid, self.nodes)
+        w = straight_guess(program) if guess is None else from_extremal(program, guess)
+        scale = designer_units(program, w)
+        program = eqx.tree_at(lambda p: p.scale, program, scale)
+        w = Primal(
+            w.x0 / scale.x, w.x / scale.x, w.u / scale.u, w.times / scale.t, w.p / scale.p,
+            w.path, w.end,
+        )  # fmt: skip
+        node, end = program.values(w)
+        return program, w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+
+
+def unit_scale(problem: Problem) -> Scale:
+    path, end = constraint_counts(problem)
+    one = jnp.ones((), jnp.result_type(float))
+    many = lambda k: jnp.ones(k, one.dtype)
+    return Scale(
+        many(problem.n), many(problem.m), one, many(len(parameters(problem))), many(path),
+        many(end), one,
+    )  # fmt: skip
+
+
+def horizon_guess(problem: Problem) -> tuple[Array, Array]:
+    """Times to start from: given, guessed, or one unit where nothing is said."""
+    dtype = jnp.result_type(float)
+    t0 = jnp.asarray(start_value(problem.initial_time), dtype)
+    tf = problem.final_time
+    if not is_free(tf) or tf.guess is not None:
+        return t0, jnp.asarray(start_value(tf), dtype)
+    lo, hi = jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype)
+    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    free = jnp.clip(t0 + 1.0, lo, hi)
+    return t0, jnp.where(bounded, jnp.where(bounded, (lo + hi) / 2, 0.0), free)
+
+
+def straight_guess(program: Transcription) -> Primal:
+    """States on a straight line to the nearest end that meets the endpoint constraints; controls
+    in the middle of their bounds. In user units."""
+    problem, size = with_parameters(program.problem, None), program.sizes
+    dtype = program.fractions.dtype
+    lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
+    x0 = jnp.clip(initial_values(program.problem, dtype), lo, hi)
+    t0, tf = horizon_guess(program.problem)
+    e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, size.end, dtype)
+    scale = state_scale(lo, hi, x0)
+
+    def nearer(_: int, xf: Array) -> Array:
+        at = lambda y: problem.endpoint_constraints(x0, xf + y * scale, t0, tf)
+        e, J = at(jnp.zeros_like(xf)), jax.jacfwd(at)(jnp.zeros_like(xf))
+        miss = e - jnp.clip(e, e_lo, e_hi)
+        gram = J @ J.T
+        ridge = 1e-8 * (jnp.trace(gram) + 1e-30) * jnp.eye(size.end, dtype=dtype)
+        step = J.T @ small_solve(gram + ridge, miss)
+        step = jnp.where(jnp.isfinite(step), step, 0.0)
+        return jnp.clip(xf - scale * step, lo, hi)
+
+    xf = jax.lax.fori_loop(0, 8, nearer, x0) if size.end else x0
+    u = start_control(program.problem, dtype)
+    rule = program.rule
+    s = (
+        program.fractions[:-1, None]
+        + jnp.diff(program.fractions)[:, None] * (jnp.asarray(rule.support[1:], dtype) + 1) / 2
+    )
+    x = x0 + s[:, :, None] * (xf - x0)
+    p = [jnp.asarray(start_value(v), dtype) for v in parameters(program.problem)]
+    return Primal(
+        x0,
+        x,
+        jnp.broadcast_to(u, (size.segments, size.nodes, size.m)),
+        jnp.stack([t0, tf]),
+        jnp.stack(p) if p else jnp.zeros(0, dtype),
+        jnp.zeros((size.segments, size.nodes, size.path), dtype),
+        jnp.zeros(size.end, dtype),
+    )
+
+
+def from_extremal(program: Transcription, guess: Extremal) -> Primal:
+    """States and controls of `guess` at this mesh's times. In user units."""
+    size, rule, dtype = program.sizes, program.rule, program.fractions.dtype
+    t0, tf = guess.t[0], guess.t[-1]
+    tau = lambda a: jnp.asarray(a, dtype)
+    at = lambda a: (
+        t0
+        + (tf - t0)
+        * (program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * (tau(a) + 1) / 2)
+    )
+    fill = lambda y: jnp.concatenate(
+        [y, jnp.zeros((*y.shape[:-1], size.n - y.shape[-1]), dtype)], axis=-1
+    )
+    point = jax.vmap(jax.vmap(guess.point))
+    x = fill(point(at(rule.support[1:])).x)
+    p = [jnp.asarray(start_value(v), dtype) for v in parameters(program.problem)]
+    return Primal(
+        fill(guess.x[0]),
+        x,
+        point(at(rule.nodes)).u,
+        jnp.stack([t0, tf]),
+        jnp.stack(p) if p else jnp.zeros(0, dtype),
+        jnp.zeros((size.segments, size.nodes, size.path), dtype),
+        jnp.zeros(size.end, dtype),
+    )
+
+
+def state_scale(lo: Array, hi: Array, *seen: Array) -> Array:
+    """The larger finite bound; else the largest value seen; else 1."""
+    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    wide = jnp.maximum(jnp.abs(jnp.where(bounded, lo, 0.0)), jnp.abs(jnp.where(bounded, hi, 0.0)))
+    largest = jnp.max(jnp.abs(jnp.stack([jnp.broadcast_to(v, lo.shape) for v in seen])), axis=0)
+    scale = jnp.where(bounded & (wide > 0), wide, largest)
+    return jnp.where(scale > 1e-8, scale, 1.0)
+
+
+def designer_units(program: Transcription, w: Primal) -> Scale:
+    """Scales from bounds and the guess; constraints and objective by their gradients there."""
+    problem, size, dtype = program.problem, program.sizes, program.fractions.dtype
+    x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
+    u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
+    x = state_scale(x_lo, x_hi, *w.x.reshape(-1, size.n), w.x0)
+    u = state_scale(u_lo, u_hi, jnp.zeros(size.m, dtype))
+    t = jnp.maximum(w.times[1] - w.times[0], 1e-8)
+    p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)
+    scale = program.scale._replace(x=x, u=u, t=t, p=p)
+    program = eqx.tree_at(lambda q: q.scale, program, scale)
+    scaled = w._replace(x0=w.x0 / x, x=w.x / x, u=w.u / u, times=w.times / t, p=w.p / p)
+    nodes, ends = program.derivatives(scaled)
+    n = size.n
+    rows = jnp.max(jnp.abs(nodes.jacobian), axis=(0, 1, 3), initial=0.0)
+    usable = lambda a: jnp.where(jnp.isfinite(a) & (a > 1e-8), a, 1.0)
+    weights = jnp.asarray(program.rule.w, dtype)[None, :, None]
+    cost = jnp.max(jnp.abs(nodes.jacobian[:, :, n] / weights))
+    end_rows = jnp.max(jnp.abs(ends.jacobian), axis=1)
+    objective = usable(jnp.maximum(cost, end_rows[0]))
+    return scale._replace(path=usable(rows[n + 1 :]), end=usable(end_rows[1:]), objective=objective)
+
+
+def to_extremal(
+    problem: Problem,
+    program: Transcription,
+    box: Bounds,
+    solution: interior_point.Solution,
+    certifier: Any,
+) -> Extremal:
+    """User units; costates by the covector mapping theorem (eqs 23-25)."""
+    size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
+    dtype, n, S = program.fractions.dtype, size.n, size.segments
+    support = program.support(w)
+    whole = lambda a: jnp.concatenate([a[:, :-1].reshape(-1, a.shape[2]), a[-1, -1:]])
+    t_support = node_times(program, w, rule.support)
+    t = jnp.concatenate([t_support[:, :-1].reshape(-1), t_support[-1, -1:]])
+    lam, before = costates(program, solution)
+    to_user = scale.objective / scale.x
+    # Controls and multipliers live at the nodes; the ends that are none, extrapolate them.
+    spread = extrapolation(program)
+    u = jnp.einsum("pk,skm->spm", spread, w.u)
+    u_lo, u_hi = box.lo.u[0, 0], box.hi.u[0, 0]
+    u = jnp.clip(u, u_lo, u_hi)
+    rate = jnp.diff(program.fractions) * (w.times[1] - w.times[0]) / 2  # dt/dtau, scaled
+    weight = jnp.asarray(rule.w, dtype)[None, :, None] * rate[:, None, None] * scale.t
+    over_nodes = lambda a: whole(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
+    state = jnp.zeros((S, size.after + 1, n), dtype)
+    net = solution.zu.x - solution.zl.x
+    own = slice(rule.first, rule.first + size.nodes)
+    state = state.at[:, 1:].set(net)
+    state = over_nodes(state[:, own]) / scale.x
+    status = solution.status
+    result = RESULTS.where(
+        status == interior_point.CONVERGED, RESULTS.successful, RESULTS.optimiser_stopped
+    )
+    result = RESULTS.where(status == interior_point.INFEASIBLE, RESULTS.infeasible, result)
+    finite = jnp.all(jnp.isfinite(support)) & jnp.all(jnp.isfinite(w.u))
+    result = RESULTS.where(finite, result, RESULTS.optimiser_stopped)
+    k, q = problem.n, size.end - (n - problem.n)
+    f, _ = program.objective_and_residual(w)
+    inner = with_parameters(problem, w.p * scale.p)
+    del inner
+    return Extremal(
+        t=t * 1.0,
+        x=whole(support)[:, :k] * scale.x[:k],
+        u=whole(u) * scale.u,
+        reference_nodes=jnp.asarray(rule.support, dtype),
+        u_before=u[:, -1] * scale.u,
+        costate=whole(lam)[:, :k] * to_user[:k],
+        costate_before=before[:, :k] * to_user[:k],
+        final_time=w.times[1] * scale.t,
+        objective=f * scale.objective,
+        multipliers=Multipliers(
+            (solution.y.end * scale.objective / scale.end)[:q],
+            over_nodes(solution.y.path) / scale.path,
+            state[:, :k],
+            over_nodes(solution.zu.u - solution.zl.u) / scale.u,
+        ),
+        result=result,
+        residual=solution.violation,
+        problem=problem,
+        certifier=certifier,
+    )
+
+
+def extrapolation(program: Transcription) -> Float[Array, "support node"]:
+    """Values at the support points of the polynomial through the nodes."""
+    rule = program.rule
+    gaps = rule.nodes[:, None] - rule.nodes[None, :] + np.eye(len(rule.nodes))
+    weights = 1 / np.prod(2 * gaps - np.eye(len(rule.nodes)), axis=1)
+    dx = rule.support[:, None] - rule.nodes[None, :]
+    hit = dx == 0
+    terms = weights / np.where(hit, 1.0, dx)
+    terms = np.where(hit.any(axis=1, keepdims=True), hit, terms)
+    return jnp.asarray(terms / terms.sum(axis=1, keepdims=True), program.fractions.dtype)
+
+
+def costates(
+    program: Transcription, solution: interior_point.Solution
+) -> tuple[Float[Array, "segment support n"], Float[Array, "segment n"]]:
+    """Scaled costates at the support points, and just before the end of each segment.
+
+    With the defect multipliers y of the Lagrangian f + y^T (A X - B F), lambda = -B^T y/w at the
+    nodes (Remark 3). At a segment's start the costate is what the segment's Lagrangian gives for
+    its derivative there, the closure condition; LGL and CGL solutions carry besides a multiple of
+    the left null vector of D, fixed per state by both closures.
+    """
+    size, rule, w, y = program.sizes, program.rule, solution.w, solution.y
+    dtype, n, C = program.fractions.dtype, size.n, size.nodes
+    A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
+    weights = jnp.asarray(rule.w, dtype)
+    f_part = program.node_weights(y)
+    nodal = f_part[:, :, :n] / weights[None, :, None]
+    nodes, ends = program.derivatives(w)
+    force = jnp.einsum("sko,skoi->ski", f_part, nodes.jacobian)[:, :, :n]
+    on_support = jnp.einsum("rp,srn->spn", A, y.defect)
+    own = slice(rule.first, rule.first + C)
+    on_support = on_support.at[:, own].add(force)
+    start = on_support[:, 0]
+    # At a shared end the next segment takes over, after what state bounds there contribute.
+    e = jnp.concatenate([jnp.ones(1, dtype), y.end]) @ ends.jacobian
+    net = (solution.zu.x - solution.zl.x)[:, -1]
+    after = jnp.concatenate([start[1:], e[-n:][None]])
+    before = after + net
+    if len(rule.extra):
+        v = jnp.asarray(left_null(program.family, program.points), dtype) / weights
+        gamma = ((nodal[:, 0] - start) / v[0] + (nodal[:, -1] - before) / v[-1]) / 2
+        nodal = nodal - v[None, :, None] * gamma[:, None]
+    lam = jnp.zeros((size.segments, size.after + 1, n), dtype)
+    lam = lam.at[:, own].set(nodal).at[:, 0].set(start).at[:, -1].set(before)
+    return lam, before
