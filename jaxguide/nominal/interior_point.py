@@ -31,12 +31,14 @@ _tree = jax.tree_util.tree_map
 _KAPPA_EPS, _KAPPA_MU, _THETA_MU, _TAU_MIN = 10.0, 0.2, 1.5, 0.99
 _KAPPA_SIGMA, _KAPPA_D, _S_MAX = 1e10, 1e-5, 100.0
 _GAMMA, _DELTA, _S_THETA, _S_PHI, _ETA = 1e-5, 1.0, 1.1, 2.3, 1e-4
-_DELTA_FIRST, _DELTA_MAX = 1e-4, 1e20
+_DELTA_FIRST, _DELTA_MAX = 1e-4, 1e12
+_RELAX = 1e-9  # of every bound, so that a state may end on one and the interior is not empty
+_S_D_MAX = 1e4  # multipliers may not excuse more than this of the gradient
 _HALVINGS, _FILTER = 30, 128
 _MULTIPLIERS_MAX = 1e3  # of the first estimate; a larger one is worth less than none
 
 # Kinds of pass through the loop.
-_NEWTON, _CORRECT, _RESTORE, _ESTIMATE = 0, 1, 2, 3
+_NEWTON, _RESTORE, _ESTIMATE = 0, 1, 2
 RUNNING, CONVERGED, INFEASIBLE, TOO_MANY, STALLED = 0, 1, 2, 3, 4
 
 
@@ -80,8 +82,6 @@ class _State(NamedTuple):
     theta_entry: Array  # violation at which restoration began
     delta: Array  # last regularisation that was needed
     mode: Array
-    saved: kkt.Step  # the step whose correction is sought
-    corrected: Residual  # the residual it is sought for
     alpha: Array
     k: Array
     status: Array
@@ -102,11 +102,11 @@ class _Box(NamedTuple):
 def boxed(bounds: Bounds) -> _Box:
     """Nodes between bounds that (nearly) coincide get a little room; other such entries are given."""
     lo, hi = bounds
-    room = lambda a, b: 1e-8 * jnp.maximum(1.0, jnp.abs(a)) * (b - a < 1e-8)
-    widen = lambda a, b: (a - room(a, b), b + room(a, b))
-    (xl, xu), (ul, uu) = widen(lo.x, hi.x), widen(lo.u, hi.u)
-    lo, hi = lo._replace(x=xl, u=ul), hi._replace(x=xu, u=uu)
+    room = lambda b: _RELAX * jnp.maximum(1.0, jnp.abs(b))
     given = _tree(lambda a, b: a >= b, lo, hi)
+    given = given._replace(x=jnp.zeros_like(given.x), u=jnp.zeros_like(given.u))
+    lo = _tree(lambda a, g: jnp.where(g, a, a - room(a)), lo, given)
+    hi = _tree(lambda b, g: jnp.where(g, b, b + room(b)), hi, given)
     below = _tree(lambda a, g: jnp.isfinite(a) & ~g, lo, given)
     above = _tree(lambda b, g: jnp.isfinite(b) & ~g, hi, given)
     return _Box(lo, hi, below, above, given)
@@ -237,6 +237,7 @@ def optimality_error(
     z = _total(zl) + _total(zu)
     duals = _total(_tree(jnp.abs, y)) + z
     s_d = jnp.maximum(_S_MAX, duals / (_count(y) + 2 * _count(w))) / _S_MAX
+    s_d = jnp.minimum(s_d, _S_D_MAX)
     s_c = jnp.maximum(_S_MAX, z / (2 * _count(w))) / _S_MAX
     short = lambda a, z, on: jnp.where(on, a * z - mu, 0.0)
     gap = jnp.maximum(
@@ -266,7 +267,7 @@ def minimise(
         _Filter(slots, slots, nought),
         1e4 * jnp.maximum(1.0, theta), 1e-4 * jnp.maximum(1.0, theta), theta,
         zero, nought + _ESTIMATE,
-        kkt.Step(_tree(jnp.zeros_like, w), y), c, zero, nought, nought + RUNNING, zero + jnp.inf,
+        zero, nought, nought + RUNNING, zero + jnp.inf,
         jnp.zeros((0, 0), dtype),
     )  # fmt: skip
     body = lambda s: _pass(program, box, options, s)
@@ -280,8 +281,7 @@ def minimise(
 def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
     """One step of any kind."""
     n = program.sizes.n
-    newton, correct = s.mode == _NEWTON, s.mode == _CORRECT
-    restore, estimate = s.mode == _RESTORE, s.mode == _ESTIMATE
+    newton, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
     nodes, ends = program.derivatives(s.w)
     f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
     low, high = _gaps(box, s.w)
@@ -297,88 +297,95 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     filter = s.filter._replace(used=jnp.where(mu < s.mu, 0, s.filter.used))
     tau = jnp.maximum(_TAU_MIN, 1 - mu)
 
-    # The system of this kind of step.
-    H, H_end = program.hessians(s.w, s.y)
+    # The system of this kind of step: Newton's; nearest to feasible; multipliers alone.
     flat = restore | estimate
-    H, H_end = _where(flat, _tree(jnp.zeros_like, (H, H_end)), (H, H_end))
-    J = jnp.where(restore, nodes.jacobian.at[:, :, n].set(0.0), nodes.jacobian)
-    J_end = jnp.where(restore, ends.jacobian.at[0].set(0.0), ends.jacobian)
+    hessians = program.hessians(s.w, s.y)
+    hessians = _where(flat, _tree(jnp.zeros_like, hessians), hessians)
     sigma = _tree(lambda z, a, u, b: z / a + u / b, s.zl, low, s.zu, high)
     ones, zeros = _tree(jnp.ones_like, sigma), _tree(jnp.zeros_like, sigma)
-    slack_only = zeros._replace(path=ones.path, end=ones.end)
-    sigma = _where(estimate, slack_only, sigma)
-    pull = _where(estimate, _tree(lambda a, b: b - a, s.zl, s.zu), _pull(box, low, high, mu))
-    c_used = _where(correct, s.corrected, _where(estimate, _tree(jnp.zeros_like, c), c))
-    y_used = _where(flat, _tree(jnp.zeros_like, s.y), s.y)
-    system = kkt.System(
-        Nodes(nodes.value, J), Ends(ends.value, J_end), H, H_end, c_used, sigma, pull, y_used,
-        box.given,
-    )  # fmt: skip
+    sigma = _where(estimate, zeros._replace(path=ones.path, end=ones.end), sigma)
+    system = kkt.System(nodes, ends, *hessians, sigma, box.given)
+    gradient = _gradient(program, nodes, ends, s.w)
+    pull = _pull(box, low, high, mu)
+    barrier = _tree(lambda a, b: a + b, gradient, pull)
+    bare = _tree(lambda g, a, b: g - a + b, gradient, s.zl, s.zu)
+    force = _where(estimate, bare, _where(restore, pull, barrier))
+    was = _where(flat, _tree(jnp.zeros_like, s.y), s.y)
+    load = lambda c: kkt.Load(force, c._replace(path=c.path + kkt.COMPLIANCE * was.path))
     segments = kkt.eliminate(program, system)
-    rho = 1e2 * (1 + _largest(H))
+    rho = 1e2 * (1 + _largest(hessians))
 
     # Regularised until the inertia is right (algorithm IC).
     first = jnp.where(estimate, 1.0, jnp.where(restore, jnp.sqrt(mu), 0.0))
 
     def attempt(carry: tuple) -> tuple:
-        delta, _, _, tries = carry
-        step, ok = kkt.solve(program, system, segments, delta, rho)
-        ok = ok & _finite(step)
+        delta, _, _ = carry
+        factor, ok = kkt.factorise(program, system, segments, delta, rho)
         again = jnp.where(s.delta > 0, jnp.maximum(1e-20, s.delta / 3), _DELTA_FIRST)
         grow = jnp.where(s.delta > 0, 8.0, 100.0)
         following = jnp.where(delta > first, delta * grow, jnp.maximum(again, 8 * delta))
-        return jnp.where(ok, delta, following), step, ok, tries + 1
+        return jnp.where(ok, delta, following), factor, ok
 
-    blank = kkt.Step(zeros, _tree(jnp.zeros_like, s.y))
-    delta, step, regular, _ = jax.lax.while_loop(
-        lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False), 0)
+    blank = jax.eval_shape(lambda d: kkt.factorise(program, system, segments, d, rho)[0], first)
+    blank = _tree(lambda a: jnp.zeros(a.shape, a.dtype), blank)
+    delta, factor, regular = jax.lax.while_loop(
+        lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False))
     )
     delta_last = jnp.where(regular & ~flat & (delta > 0), delta, s.delta)
+    towards = lambda c: kkt.solve(program, system, segments, factor, load(c))
+    step = towards(_where(estimate, _tree(jnp.zeros_like, c), c))
+    regular = regular & _finite(step)
     dw = step.primal
 
-    # The line search: the full step first, then, if that fails, halves of the uncorrected one.
+    # The filter line search: the full step, then its second-order correction, then halves.
     phi_of = lambda f, w: f + _barrier(box, w, mu)
     theta, phi = _norm1(c), phi_of(f, s.w)
-    along = _where(correct, s.saved.primal, dw)
     longest = _longest(low, high, dw, box, tau)
-    slope = _slope(program, nodes, ends, along, _pull(box, low, high, mu))
+    slope = _total(_tree(lambda a, b: a * b, barrier, dw))
+    steep = jnp.where(slope < 0, -slope, 0.0)
+    slack = 1e2 * jnp.finfo(phi.dtype).eps * (1 + jnp.abs(phi))
 
-    def judge(alpha: Array, d: Primal) -> tuple[Array, Array, Residual, Array]:
-        w = _move(s.w, alpha, d)
+    def judge(alpha: Array, d: Primal, length: Array) -> tuple[Array, Array, Residual, Array]:
+        """Whether a move by `length` d is acceptable as a step of size `alpha`."""
+        w = _move(s.w, length, d)
         f, c = program.objective_and_residual(w)
         theta_new, phi_new = _norm1(c), phi_of(f, w)
         sane = jnp.isfinite(theta_new) & jnp.isfinite(phi_new) & (theta_new <= s.theta_max)
-        falling = slope < 0
-        steep = jnp.where(falling, -slope, 0.0)
-        switch = falling & (alpha * steep**_S_PHI > _DELTA * theta**_S_THETA)
-        f_type = switch & (theta <= s.theta_min)
-        slack = 1e2 * jnp.finfo(phi.dtype).eps * (1 + jnp.abs(phi))
+        switch = alpha * steep**_S_PHI > _DELTA * theta**_S_THETA
+        f_type = (slope < 0) & switch & (theta <= s.theta_min)
         armijo = phi_new <= phi + _ETA * alpha * slope + slack
         progress = (theta_new <= (1 - _GAMMA) * theta) | (phi_new <= phi - _GAMMA * theta + slack)
-        good = jnp.where(f_type, armijo, progress) & _acceptable(filter, theta_new, phi_new)
+        good = jnp.where(f_type, armijo, progress) & _acceptable(filter, theta_new, phi_new - slack)
         nearer = theta_new <= (1 - 1e-4 * alpha) * theta
         return sane & jnp.where(restore, nearer, good), f_type & armijo, c, theta_new
 
-    full, f_type, c_new, theta_new = judge(longest, dw)
-    try_correction = newton & ~full & (theta_new >= theta) & jnp.isfinite(theta_new)
+    full, f_type, c_new, theta_new = judge(longest, dw, longest)
+    wanted = newton & regular & ~full & ~done & (theta_new >= theta) & jnp.isfinite(theta_new)
+
+    def correct(_: None) -> tuple[kkt.Step, Array, Array, Array]:
+        corrected = towards(_tree(lambda a, b: longest * a + b, c, c_new))
+        length = _longest(low, high, corrected.primal, box, tau)
+        ok, f_type, _, _ = judge(longest, corrected.primal, length)
+        return corrected, length, ok & _finite(corrected), f_type
+
+    skip = lambda _: (step, longest, jnp.array(False), f_type)
+    better, length, corrected, better_f_type = jax.lax.cond(wanted, correct, skip, None)
 
     def shorten(carry: tuple) -> tuple:
         alpha, _, _, k = carry
-        alpha = alpha / 2
-        ok, f_type, _, _ = judge(alpha, along)
-        return alpha, ok, f_type, k + 1
+        ok, f_type, _, _ = judge(alpha / 2, dw, alpha / 2)
+        return alpha / 2, ok, f_type, k + 1
 
-    begin = jnp.where(correct, s.alpha, longest)
-    short, found, short_f_type, _ = jax.lax.while_loop(
-        lambda a: ~a[1] & (a[3] < _HALVINGS) & regular,
+    alpha, found, short_f_type, _ = jax.lax.while_loop(
+        lambda a: ~a[1] & (a[3] < _HALVINGS),
         shorten,
-        (begin, full | try_correction | estimate | done, f_type, 0),
+        (longest, full | corrected | estimate | done | ~regular, f_type, 0),
     )
-    accepted = regular & found & ~try_correction & ~estimate & ~done
-    alpha = jnp.where(full, longest, short)
-    d = _where(full, dw, along)
-    dual = _where(full | ~correct, step.dual, s.saved.dual)
-    f_type = jnp.where(full, f_type, short_f_type)
+    accepted = regular & found & ~estimate & ~done
+    alpha = jnp.where(corrected, length, alpha)
+    moved = _where(corrected, better, step)
+    d = moved.primal
+    f_type = jnp.where(corrected, better_f_type, short_f_type)
 
     # Move.
     rate = lambda z, a, dw, on, sign: jnp.where(on, mu / a - z - sign * z / a * dw, 0.0)
@@ -392,49 +399,37 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     )
     zl = _tree(keep, _move(s.zl, alpha_z, dzl), low, box.below)
     zu = _tree(keep, _move(s.zu, alpha_z, dzu), high, box.above)
-    y = _tree(lambda a, b: a + alpha * (b - a), s.y, dual)
-
-    modest = _finite(step.dual) & (_largest(step.dual) <= _MULTIPLIERS_MAX) & regular
-    y_estimate = _where(modest, step.dual, _tree(jnp.zeros_like, s.y))
-    y = _where(restore, s.y, y)
+    y = _tree(lambda a, b: a + alpha * (b - a), s.y, moved.dual)
+    modest = regular & (_largest(step.dual) <= _MULTIPLIERS_MAX)
+    estimated = _where(modest, step.dual, _tree(jnp.zeros_like, s.y))
     new_w = _where(accepted, w, s.w)
-    new_y = _where(estimate, y_estimate, _where(accepted, y, s.y))
+    new_y = _where(estimate, estimated, _where(accepted & ~restore, y, s.y))
     new_zl, new_zu = _where(accepted, (zl, zu), (s.zl, s.zu))
 
     # What comes next.
     f_at, c_at = program.objective_and_residual(new_w)
     theta_at = _norm1(c_at)
-    home = accepted & restore & (theta_at <= 0.9 * s.theta_entry)
-    home = home & _acceptable(filter, theta_at, phi_of(f_at, new_w))
-    solved = accepted & restore & (_largest(c_at) <= options.tolerance / 10)
-    failed = ~accepted & ~try_correction & ~estimate & ~done
-    into = failed & (newton | correct)
-    stuck = failed & restore
+    home = (theta_at <= 0.9 * s.theta_entry) & _acceptable(filter, theta_at, phi_of(f_at, new_w))
+    home = accepted & restore & (home | (_largest(c_at) <= options.tolerance / 10))
+    failed = ~accepted & ~estimate & ~done
+    into, stuck = failed & newton, failed & restore
     feasible = _largest(c) <= jnp.maximum(1e-8, options.tolerance)
-    mode = jnp.where(restore & ~(home | solved), _RESTORE, _NEWTON)
-    mode = jnp.where(home | solved, _ESTIMATE, mode)
-    mode = jnp.where(try_correction, _CORRECT, mode)
-    mode = jnp.where(into, _RESTORE, mode)
-    add = (accepted & (newton | correct) & ~f_type) | into
-    filter = _augment(filter, theta, phi, add)
+    mode = jnp.where((restore & ~home) | into, _RESTORE, _NEWTON)
+    mode = jnp.where(home, _ESTIMATE, mode)
+    filter = _augment(filter, theta, phi, (accepted & newton & ~f_type) | into)
     status = jnp.where(done, CONVERGED, RUNNING)
     status = jnp.where(stuck, jnp.where(feasible, STALLED, INFEASIBLE), status)
     status = jnp.where(into & feasible, STALLED, status)
     status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)
-    corrected = _tree(lambda a, b: longest * a + b, c, c_new)
     return _State(
         new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
-        jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
-        step, corrected, longest, s.k + 1, status.astype(s.status.dtype), error_now, s.log,
+        jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype), alpha,
+        s.k + 1, status.astype(s.status.dtype), error_now, s.log,
     )  # fmt: skip
 
 
-def _slope(
-    program: Transcription, nodes: Nodes, ends: Ends, d: Primal, pull: Primal
-) -> Float[Array, ""]:
-    """Directional derivative of the barrier objective."""
+def _gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal) -> Primal:
+    """Of the objective."""
+    on_support = jnp.zeros_like(program.support(w))
     n = program.sizes.n
-    dq = program.inputs(d)
-    objective = jnp.sum(nodes.jacobian[:, :, n] * dq)
-    objective = objective + jnp.dot(ends.jacobian[0], program.end_inputs(d))
-    return objective + _total(_tree(lambda a, b: a * b, pull, d))
+    return kkt.transpose(program, w, nodes.jacobian[:, :, n], ends.jacobian[0], on_support)

@@ -230,8 +230,14 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     n = size.n
     rows = jnp.max(jnp.abs(nodes.jacobian), axis=(0, 1, 3), initial=0.0)
     usable = lambda a: jnp.where(jnp.isfinite(a) & (a > 1e-8), a, 1.0)
+    # The objective's gradient a unit away too: at rest it may vanish.
+    away = scaled._replace(x=scaled.x + 1.0, u=scaled.u + 1.0)
+    steeper, _ = program.derivatives(away)
     weights = jnp.asarray(program.rule.w, dtype)[None, :, None]
-    cost = jnp.max(jnp.abs(nodes.jacobian[:, :, n] / weights))
+    largest = lambda a: jnp.nanmax(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0))
+    cost = jnp.maximum(
+        largest(nodes.jacobian[:, :, n] / weights), largest(steeper.jacobian[:, :, n] / weights)
+    )
     end_rows = jnp.max(jnp.abs(ends.jacobian), axis=1)
     objective = usable(jnp.maximum(cost, end_rows[0]))
     return scale._replace(path=usable(rows[n + 1 :]), end=usable(end_rows[1:]), objective=objective)
