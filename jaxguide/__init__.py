@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jaxguide.neighboring.gains import gain_schedule as gain_schedule
     from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
     from jaxguide.neighboring.linearization import linearize as linearize
+    from jaxguide.nominal.pseudospectral import Pseudospectral as Pseudospectral
     from jaxguide.nominal.shooting import Shooting as Shooting
     from jaxguide.problem import Free as Free
     from jaxguide.problem import Problem as Problem
@@ -64,6 +65,7 @@ _HOME = {
     "Normal": "montecarlo.dispersions",
     "OpenLoop": "laws.law",
     "Problem": "problem",
+    "Pseudospectral": "nominal.pseudospectral",
     "RESULTS": "types",
     "RungeKutta4": "flight.integrators",
     "Shooting": "nominal.shooting",

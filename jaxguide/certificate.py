@@ -1,5 +1,7 @@
 """The Certificate: how good an extremal is, each necessary condition as a number with its bound."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -20,7 +22,7 @@ from jaxguide.problem import (
     initially_free,
     is_free,
 )
-from jaxguide.spectral import interpolation_matrix, nodes_lg, nodes_lgl
+from jaxguide.spectral import interpolation_matrix, legendre_matrix, nodes_lg
 from jaxguide.trajectory import Extremal
 
 
@@ -120,20 +122,36 @@ class _Rows:
         )
 
 
-def certify(extremal: Extremal, costly: bool = False) -> Certificate:
+def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -> Certificate:
     """Checks an extremal against the conditions it should meet, independently of its solver.
 
-    **Arguments:** `costly`: also fly the interpolated control with an adaptive integrator
-    (Diffrax, 1e-11) and compare with the extremal's own states; and look for conjugate points, past
-    which an extremal minimises nothing, by a backward sweep of its second variation. Errors are
-    relative to the size of what is compared, so the tolerances (1e-8 for most) hold in any units.
+    **Arguments:** `tolerance`: of the relative errors; `costly`: also fly the interpolated control
+    with an adaptive integrator (Diffrax, 1e-11) and compare with the extremal's own states; and
+    look for conjugate points, past which an extremal minimises nothing, by a backward sweep of its
+    second variation. Errors are relative to the size of what is compared, so the tolerance holds
+    in any units.
 
     **Source:** 2002 paper eqs (2)-(9); review, section 4.
     """
-    return (_full if costly else _quick)(extremal)
+    return _checks(extremal, costly, tolerance)
 
 
-def _checks(extremal: Extremal, costly: bool) -> Certificate:
+@functools.cache
+def certifier(tolerance: float) -> Callable[[Extremal], Certificate]:
+    """`certify` to a tolerance: one function for each, so that equal ones compile once."""
+    return functools.partial(certify, tolerance=tolerance)
+
+
+def constrained_hamiltonian(
+    problem: Problem, t: Any, x: Array, u: Array, costate: Array, held: Array
+) -> Float[Array, ""]:
+    """H with the multipliers `held` of path constraints, states and controls: review, H bar."""
+    h = problem.path_constraints(t, x, u)
+    return hamiltonian(problem, t, x, u, costate) + jnp.dot(held, jnp.concatenate([h, x, u]))
+
+
+@eqx.filter_jit
+def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     problem, t = extremal.problem, extremal.t
     x, u, costate = extremal.x, extremal.u, extremal.costate
     rows = _Rows()
@@ -158,16 +176,22 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     mid = (breaks[1:] + breaks[:-1]) / 2
     times = mid[:, None] + half[:, None] * gauss[None, :]
     to_gauss = interpolation_matrix(extremal.reference_nodes, gauss)
-    at = lambda v: jnp.einsum("gp,spk->sgk", to_gauss, extremal.by_segment(v))
-    gx, gu, glam = at(x), at(u), at(costate)
-    over = lambda f: jax.vmap(jax.vmap(lambda t, x, u, c: f(problem, t, x, u, c)))
-    f = over(lambda p, t, x, u, c: p.dynamics(t, x, u))(times, gx, gu, glam)
-    h_x = over(jax.grad(hamiltonian, argnums=2))(times, gx, gu, glam)
+    at = lambda parts: jnp.einsum("gp,spk->sgk", to_gauss, parts)
+    u_parts, lam_parts = extremal.control_by_segment(), extremal.costate_by_segment()
+    gx, gu, glam = at(extremal.by_segment(x)), at(u_parts), at(lam_parts)
+    multipliers = extremal.multipliers
+    held = jnp.concatenate([multipliers.path, multipliers.state, multipliers.control], axis=1)
+    gheld = at(extremal.by_segment(held))
+    over = lambda f: jax.vmap(jax.vmap(lambda t, x, u, c, k: f(problem, t, x, u, c, k)))
+    f = over(lambda p, t, x, u, c, k: p.dynamics(t, x, u))(times, gx, gu, glam, gheld)
+    h_x = over(jax.grad(constrained_hamiltonian, argnums=2))(times, gx, gu, glam, gheld)
     quad = lambda v: half[:, None] * jnp.einsum("g,sgk->sk", weights, v)
     step = extremal.reference_nodes.shape[0] - 1
-    ends = lambda v: v[step::step] - v[:-1:step]
-    rows.add("state equation", states, (ends(x) - quad(f)) / (1e-3 + span)[None], breaks[1:], 1e-9)
-    rows.add("costate equation", costates, (ends(costate) + quad(h_x)) / lam_span, breaks[1:], 1e-9)
+    ends = lambda parts: parts[:, -1] - parts[:, 0]
+    moved, turned = ends(extremal.by_segment(x)), ends(lam_parts)
+    scaled = (moved - quad(f)) / (1e-3 + span)[None]
+    rows.add("state equation", states, scaled, breaks[1:], tight)
+    rows.add("costate equation", costates, (turned + quad(h_x)) / lam_span, breaks[1:], tight)
 
     # Boundary data and transversality, eqs (3), (8), (9).
     x0, xf, t0, tf = x[0], x[-1], t[0], t[-1]
@@ -175,35 +199,35 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
     lo, hi = bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)
     miss = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
     labels = [f"constraint {i}" for i in range(e.shape[0])]
-    rows.add("endpoint constraints", labels, miss[None], tf[None], 1e-9)
+    rows.add("endpoint constraints", labels, miss[None], tf[None], tight)
     given, free = initial_values(problem, x.dtype), initially_free(problem)
     g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))(
         problem, extremal.multipliers.endpoint, x0, xf, t0, tf
     )
     free_mask = jnp.asarray(free)
-    rows.add("initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], 1e-9)
+    rows.add("initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], tight)
     rows.add(
-        "transversality, end", costates, ((costate[-1] - g[1]) / lam_span)[None], tf[None], 1e-9
+        "transversality, end", costates, ((costate[-1] - g[1]) / lam_span)[None], tf[None], tight
     )
     if any(free):
         gap = jnp.where(free_mask, costate[0] + g[0], 0.0) / lam_span
-        rows.add("transversality, start", costates, gap[None], t0[None], 1e-9)
+        rows.add("transversality, start", costates, gap[None], t0[None], tight)
 
     # The Hamiltonian: stationary in u, and dH/dt = H_t along the extremal.
     h_node = jax.vmap(hamiltonian, in_axes=(None, 0, 0, 0, 0))(problem, t, x, u, costate)
     h_scale = 1e-3 * lam_span + jnp.max(jnp.abs(h_node))
     if is_free(problem.final_time):
         rows.add(
-            "H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], 1e-9
+            "H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], tight
         )
-    h_t = over(jax.grad(hamiltonian, argnums=1))(times, gx, gu, glam)
+    h_t = over(jax.grad(constrained_hamiltonian, argnums=1))(times, gx, gu, glam, gheld)
     drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
     gap = (h_node[step::step] - h_node[0] - drift) / h_scale
-    rows.add("Hamiltonian rate", ("H",), gap[:, None], breaks[1:], 1e-9)
-    h_u = jax.vmap(jax.grad(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
-        problem, t, x, u, costate
+    rows.add("Hamiltonian rate", ("H",), gap[:, None], breaks[1:], tight)
+    h_u = jax.vmap(jax.grad(constrained_hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0, 0))(
+        problem, t, x, u, costate, held
     )
-    rows.add("stationarity H_u", problem.control_names, h_u / h_scale, t, 1e-9)
+    rows.add("stationarity H_u", problem.control_names, h_u / h_scale, t, tight)
     h_uu = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
         problem, t, x, u, costate
     )
@@ -225,18 +249,18 @@ def _checks(extremal: Extremal, costly: bool) -> Certificate:
         lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
         over_by = jnp.maximum(lo[None] - values, 0.0) + jnp.maximum(values - hi[None], 0.0)
         labels = labels or [f"path {i}" for i in range(values.shape[1])]
-        rows.add(name, labels, over_by, t, 1e-9)
+        rows.add(name, labels, over_by, t, tight)
 
     # Spectral tail: the last two Legendre coefficients of each segment's polynomial.
-    p = extremal.reference_nodes.shape[0]
-    vandermonde = np.polynomial.legendre.legvander(nodes_lgl(p)[0], p - 1)
-    inverse = jnp.asarray(np.linalg.inv(vandermonde), t.dtype)[-2:]
+    inverse = legendre_matrix(extremal.reference_nodes)[-2:]
     tail = lambda v, s: (
-        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", inverse, extremal.by_segment(v))), axis=1)
-        / (s if jnp.ndim(s) else s * jnp.ones(v.shape[1], v.dtype))[None]
+        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", inverse, v)), axis=1)
+        / (s if jnp.ndim(s) else s * jnp.ones(v.shape[2], v.dtype))[None]
     )
-    rows.add("spectral tail, state", states, tail(x, 1e-3 + span), breaks[1:], 1e-9)
-    rows.add("spectral tail, costate", costates, tail(costate, lam_span), breaks[1:], 1e-9)
+    rows.add(
+        "spectral tail, state", states, tail(extremal.by_segment(x), 1e-3 + span), breaks[1:], tight
+    )
+    rows.add("spectral tail, costate", costates, tail(lam_parts, lam_span), breaks[1:], tight)
     return rows.done()
 
 
@@ -273,7 +297,3 @@ def _conjugate(extremal: Extremal) -> Bool[Array, " break"]:
     terminal, times = terminal_conditions(extremal), extremal.breaks[:-1]
     pair = solve_sweeps(extremal, terminal, times, SEGMENTS, NODES, SWEEPS, ())
     return conjugate_ahead(pair.sweep, times)
-
-
-_quick = eqx.filter_jit(lambda extremal: _checks(extremal, False))
-_full = eqx.filter_jit(lambda extremal: _checks(extremal, True))

@@ -6,9 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.certificate import certify
+from jaxguide.certificate import certifier
+from jaxguide.nominal.pseudospectral import Pseudospectral
 from jaxguide.nominal.shooting import Shooting
-from jaxguide.problem import Problem, validate, with_array_leaves
+from jaxguide.nominal.transcription import BOUNDARY
+from jaxguide.problem import Problem, is_free, validate, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
@@ -20,7 +22,8 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
 
     - `problem`: the Problem; its parameters may be traced, so this may be `vmap`ped and
       differentiated (implicitly, forward and reverse).
-    - `method`: default the most accurate available, multi-start multiple shooting.
+    - `method`: `jg.Shooting` or `jg.Pseudospectral`. Default: shooting, the more accurate, unless
+      the Problem has bounds, path constraints or what else shooting cannot do.
     - `guess`: None, an Extremal of a similar problem, or initial costates (n,).
     - `throw`: raise if it fails. Under a trace nothing is raised; look at `.result`.
 
@@ -28,23 +31,43 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
     `SolveError` (with what missed, by how much and what to try) when no extremal was found.
     """
     require_x64("jg.solve")
-    method = Shooting() if method is None else method
+    if method is None:
+        method = Shooting() if _is_unconstrained(problem) else Pseudospectral()
     if isinstance(problem, Problem):
         method.check_fields(problem)
     validate(problem)
     method.check(problem)
     problem = with_array_leaves(problem)
     if is_traced((problem, guess)):
-        return method(problem, guess, certify)
+        return method(problem, guess, certifier(method.accuracy))
     extremal = _run(method, problem, guess)
     if throw:
         raise_if_failed(extremal)
     return extremal
 
 
+def _is_unconstrained(problem: Problem) -> bool:
+    """Whether nothing but equalities at the ends restricts the solution: shooting's case."""
+    if not isinstance(problem, Problem) or is_traced(
+        (problem.state_bounds, problem.control_bounds)
+    ):
+        return True
+    infinite = lambda bounds: all(np.all(np.isinf(np.asarray(b))) for b in bounds)
+    own = type(problem)
+    free = any(is_free(v) for k, v in vars(problem).items() if k not in BOUNDARY)
+    return (
+        infinite(problem.state_bounds)
+        and infinite(problem.control_bounds)
+        and own.path_constraints is Problem.path_constraints
+        and own.integrands is Problem.integrands
+        and not free
+        and np.array_equal(*np.broadcast_arrays(*problem.endpoint_bounds))
+    )
+
+
 @eqx.filter_jit
 def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
-    return method(problem, guess, certify)
+    return method(problem, guess, certifier(method.accuracy))
 
 
 def raise_if_failed(extremal: Extremal) -> None:

@@ -9,10 +9,9 @@ serves every kind of step, so that the factorisation is compiled once.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxguide.nominal import kkt
 from jaxguide.nominal.transcription import (
@@ -100,7 +99,7 @@ class _Box(NamedTuple):
 
 
 def boxed(bounds: Bounds) -> _Box:
-    """Nodes between bounds that (nearly) coincide get a little room; other such entries are given."""
+    """Bounds with a little room; entries whose bounds coincide are given, but for nodal ones."""
     lo, hi = bounds
     room = lambda b: _RELAX * jnp.maximum(1.0, jnp.abs(b))
     given = _tree(lambda a, b: a >= b, lo, hi)
@@ -280,7 +279,6 @@ def minimise(
 
 def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
     """One step of any kind."""
-    n = program.sizes.n
     newton, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
     nodes, ends = program.derivatives(s.w)
     f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
@@ -332,21 +330,17 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
         lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False))
     )
     delta_last = jnp.where(regular & ~flat & (delta > 0), delta, s.delta)
-    towards = lambda c: kkt.solve(program, system, segments, factor, load(c))
-    step = towards(_where(estimate, _tree(jnp.zeros_like, c), c))
-    regular = regular & _finite(step)
-    dw = step.primal
-
     # The filter line search: the full step, then its second-order correction, then halves.
     phi_of = lambda f, w: f + _barrier(box, w, mu)
     theta, phi = _norm1(c), phi_of(f, s.w)
-    longest = _longest(low, high, dw, box, tau)
-    slope = _total(_tree(lambda a, b: a * b, barrier, dw))
-    steep = jnp.where(slope < 0, -slope, 0.0)
     slack = 1e2 * jnp.finfo(phi.dtype).eps * (1 + jnp.abs(phi))
+    along = lambda d: _total(_tree(lambda a, b: a * b, barrier, d))
 
-    def judge(alpha: Array, d: Primal, length: Array) -> tuple[Array, Array, Residual, Array]:
+    def judge(
+        alpha: Array, slope: Array, d: Primal, length: Array
+    ) -> tuple[Array, Array, Residual, Array]:
         """Whether a move by `length` d is acceptable as a step of size `alpha`."""
+        steep = jnp.where(slope < 0, -slope, 0.0)
         w = _move(s.w, length, d)
         f, c = program.objective_and_residual(w)
         theta_new, phi_new = _norm1(c), phi_of(f, w)
@@ -359,33 +353,41 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
         nearer = theta_new <= (1 - 1e-4 * alpha) * theta
         return sane & jnp.where(restore, nearer, good), f_type & armijo, c, theta_new
 
-    full, f_type, c_new, theta_new = judge(longest, dw, longest)
-    wanted = newton & regular & ~full & ~done & (theta_new >= theta) & jnp.isfinite(theta_new)
+    def aim(carry: tuple) -> tuple:
+        """The step towards `target`, and whether all of it is acceptable; once more, corrected."""
+        k, target, first, _, _, _, _ = carry
+        step = kkt.solve(program, system, segments, factor, load(target))
+        length = _longest(low, high, step.primal, box, tau)
+        first = _where(k == 0, (step, length), first)
+        ok, f_type, c_new, theta_new = judge(first[1], along(first[0].primal), step.primal, length)
+        ok = ok & _finite(step)
+        worse = (theta_new >= theta) & jnp.isfinite(theta_new)
+        again = (k == 0) & newton & regular & ~ok & ~done & worse
+        target = _tree(lambda a, b: length * a + b, c, c_new)
+        return k + 1, target, first, (step, length), ok, f_type, again
 
-    def correct(_: None) -> tuple[kkt.Step, Array, Array, Array]:
-        corrected = towards(_tree(lambda a, b: longest * a + b, c, c_new))
-        length = _longest(low, high, corrected.primal, box, tau)
-        ok, f_type, _, _ = judge(longest, corrected.primal, length)
-        return corrected, length, ok & _finite(corrected), f_type
-
-    skip = lambda _: (step, longest, jnp.array(False), f_type)
-    better, length, corrected, better_f_type = jax.lax.cond(wanted, correct, skip, None)
+    target = _where(estimate, _tree(jnp.zeros_like, c), c)
+    none = (kkt.Step(zeros, _tree(jnp.zeros_like, s.y)), jnp.ones_like(s.alpha))
+    no, yes = jnp.array(False), jnp.array(True)
+    _, _, (step, longest), latest, full, f_type, _ = jax.lax.while_loop(
+        lambda a: a[-1], aim, (0, target, none, none, no, no, yes)
+    )
+    regular = regular & _finite(step)
+    slope = along(step.primal)
 
     def shorten(carry: tuple) -> tuple:
         alpha, _, _, k = carry
-        ok, f_type, _, _ = judge(alpha / 2, dw, alpha / 2)
+        ok, f_type, _, _ = judge(alpha / 2, slope, step.primal, alpha / 2)
         return alpha / 2, ok, f_type, k + 1
 
-    alpha, found, short_f_type, _ = jax.lax.while_loop(
+    alpha, found, f_type, _ = jax.lax.while_loop(
         lambda a: ~a[1] & (a[3] < _HALVINGS),
         shorten,
-        (longest, full | corrected | estimate | done | ~regular, f_type, 0),
+        (longest, full | estimate | done | ~regular, f_type, 0),
     )
     accepted = regular & found & ~estimate & ~done
-    alpha = jnp.where(corrected, length, alpha)
-    moved = _where(corrected, better, step)
+    moved, alpha = _where(full, latest, (step, alpha))
     d = moved.primal
-    f_type = jnp.where(corrected, better_f_type, short_f_type)
 
     # Move.
     rate = lambda z, a, dw, on, sign: jnp.where(on, mu / a - z - sign * z / a * dw, 0.0)

@@ -1,9 +1,9 @@
 """One Newton step of a transcription: its KKT system solved by elimination, segment by segment.
 
-Within a segment the states follow from its start, its controls and the clock: one LU of the defects'
-Jacobian. What is left, a quadratic in start, controls and clock, is minimised over the controls from
-the last segment to the first (a Riccati sweep), carrying the global unknowns, the final state and
-its multiplier as parameters. A small dense system of the global unknowns ends it.
+Within a segment the states follow from its start, its controls and the clock: one LU of the
+defects' Jacobian. What is left, a quadratic in start, controls and clock, is minimised over the
+controls from the last segment to the first (a Riccati sweep), carrying the global unknowns, the
+final state and its multiplier as parameters. A small dense system of the global unknowns ends it.
 
 The inertia of the whole is right, so that the step descends, if every Cholesky factorisation exists
 and the last system has as many negative eigenvalues as multipliers (Haynsworth).
@@ -412,5 +412,7 @@ def solve(
         better = apply(program, system, segments, factor, left)
         return jax.tree_util.tree_map(lambda a, b: a + b, step, better)
 
-    first = apply(program, system, segments, factor, load)
-    return jax.lax.fori_loop(0, _REFINEMENTS, refine, first)
+    # From nothing, so that the elimination is compiled once.
+    blank = Step(load.force, Dual(*load.residual))
+    blank = jax.tree_util.tree_map(jnp.zeros_like, blank)
+    return jax.lax.fori_loop(0, 1 + _REFINEMENTS, refine, blank)

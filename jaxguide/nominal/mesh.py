@@ -4,6 +4,7 @@ import functools as ft
 from typing import NamedTuple
 
 import numpy as np
+
 from jaxguide.spectral import grid
 
 FAMILIES = ("lgl", "cgl", "lgr-left", "lgr-right", "lg")

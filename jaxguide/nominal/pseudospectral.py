@@ -59,6 +59,7 @@ class Pseudospectral(eqx.Module):
     fractions: Any = None
     tolerance: float = eqx.field(static=True, default=1e-9)
     max_iterations: int = eqx.field(static=True, default=500)
+    accuracy = 1e-6  # that its certificates ask for
 
     def __check_init__(self):
         if self.grid not in FAMILIES:
@@ -254,7 +255,7 @@ def to_extremal(
     size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
     dtype, n, S = program.fractions.dtype, size.n, size.segments
     support = program.support(w)
-    whole = lambda a: jnp.concatenate([a[:, :-1].reshape(-1, a.shape[2]), a[-1, -1:]])
+    whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
     t_support = node_times(program, w, rule.support)
     t = jnp.concatenate([t_support[:, :-1].reshape(-1), t_support[-1, -1:]])
     lam, before = costates(program, solution)
@@ -281,10 +282,8 @@ def to_extremal(
     result = RESULTS.where(finite, result, RESULTS.optimiser_stopped)
     k, q = problem.n, size.end - (n - problem.n)
     f, _ = program.objective_and_residual(w)
-    inner = with_parameters(problem, w.p * scale.p)
-    del inner
     return Extremal(
-        t=t * 1.0,
+        t=t,
         x=whole(support)[:, :k] * scale.x[:k],
         u=whole(u) * scale.u,
         reference_nodes=jnp.asarray(rule.support, dtype),
@@ -330,8 +329,7 @@ def costates(
     """
     size, rule, w, y = program.sizes, program.rule, solution.w, solution.y
     dtype, n, C = program.fractions.dtype, size.n, size.nodes
-    A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
-    weights = jnp.asarray(rule.w, dtype)
+    A, weights = jnp.asarray(rule.A, dtype), jnp.asarray(rule.w, dtype)
     f_part = program.node_weights(y)
     nodal = f_part[:, :, :n] / weights[None, :, None]
     nodes, ends = program.derivatives(w)

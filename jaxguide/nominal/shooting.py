@@ -56,6 +56,7 @@ class Shooting(eqx.Module):
     coarse_steps: int = eqx.field(static=True, default=96)
     seed: int = eqx.field(static=True, default=0)
     max_steps: int = eqx.field(static=True, default=1024)
+    accuracy = 1e-9  # that its certificates ask for
 
     def __check_init__(self):
         if self.arcs < 1 or self.segments < 1 or self.segments % self.arcs:

@@ -283,14 +283,14 @@ def with_integrals(problem: Problem) -> Problem:
     )
 
 
-_BOUNDARY = ("initial_time", "final_time", "initial_state")
+BOUNDARY = ("initial_time", "final_time", "initial_state")
 
 
 def parameter_names(problem: Problem) -> tuple[str, ...]:
     """Fields that hold a `jg.Free` the solver may choose."""
     problem = getattr(problem, "inner", problem)
     names = (f.name for f in dataclasses.fields(problem))
-    return tuple(k for k in names if k not in _BOUNDARY and is_free(getattr(problem, k)))
+    return tuple(k for k in names if k not in BOUNDARY and is_free(getattr(problem, k)))
 
 
 def parameters(problem: Problem) -> list[Free]:
