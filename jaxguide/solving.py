@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxguide.certificate import certifier
 from jaxguide.nominal.pseudospectral import Pseudospectral
+from jaxguide.nominal.refinement import refined
 from jaxguide.nominal.shooting import Shooting
 from jaxguide.nominal.transcription import BOUNDARY
 from jaxguide.problem import Problem, is_free, validate, with_array_leaves
@@ -41,6 +42,8 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
     if is_traced((problem, guess)):
         return method(problem, guess, certifier(method.accuracy))
     extremal = _run(method, problem, guess)
+    if isinstance(method, Pseudospectral) and method.refinements:
+        extremal = refined(_run, method, problem, extremal)
     if throw:
         raise_if_failed(extremal)
     return extremal
@@ -61,7 +64,7 @@ def _is_unconstrained(problem: Problem) -> bool:
         and own.path_constraints is Problem.path_constraints
         and own.integrands is Problem.integrands
         and not free
-        and np.array_equal(*np.broadcast_arrays(*problem.endpoint_bounds))
+        and bool(np.all(np.asarray(problem.endpoint_bounds[0]) == problem.endpoint_bounds[1]))
     )
 
 

@@ -47,6 +47,7 @@ class Options(NamedTuple):
     tolerance: Any = 1e-9
     mu: Any = 0.1
     max_iterations: Any = 300
+    push: Any = 1e-2  # how far from the bounds to start, relative to them and to their distance
 
 
 class Solution(NamedTuple):
@@ -85,7 +86,6 @@ class _State(NamedTuple):
     k: Array
     status: Array
     error: Array
-    log: Float[Array, "row entry"]
 
 
 class _Box(NamedTuple):
@@ -111,7 +111,7 @@ def boxed(bounds: Bounds) -> _Box:
     return _Box(lo, hi, below, above, given)
 
 
-def inside(box: _Box, w: Primal, push: float = 1e-2) -> Primal:
+def inside(box: _Box, w: Primal, push: Any) -> Primal:
     """`w` moved well within its bounds, given entries put where they belong (section 3.6)."""
 
     def one(w: Array, lo: Array, hi: Array, below: Array, above: Array, given: Array) -> Array:
@@ -206,7 +206,7 @@ def _move(a: Any, alpha: Array, d: Any) -> Any:
 def _acceptable(filter: _Filter, theta: Array, phi: Array) -> Array:
     """Whether (theta, phi) is not dominated by the filter (eq. 18)."""
     better = (theta < filter.theta) | (phi < filter.phi)
-    live = jnp.arange(_FILTER) < filter.used
+    live = jnp.arange(_FILTER, dtype=filter.used.dtype) < filter.used
     return jnp.all(better | ~live)
 
 
@@ -245,13 +245,11 @@ def optimality_error(
     return jnp.maximum(jnp.maximum(_largest(gradient) / s_d, _largest(c)), gap / s_c)
 
 
-def minimise(
-    program: Transcription, bounds: Bounds, start: Primal, options: Options
-) -> tuple[Solution, Float[Array, "row entry"]]:
+def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Options) -> Solution:
     """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
     box = boxed(bounds)
     dtype = program.fractions.dtype
-    w = inside(box, start)
+    w = inside(box, start, options.push)
     mu = jnp.asarray(options.mu, dtype)
     low, high = _gaps(box, w)
     zl = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), low, box.below)
@@ -267,14 +265,11 @@ def minimise(
         1e4 * jnp.maximum(1.0, theta), 1e-4 * jnp.maximum(1.0, theta), theta,
         zero, nought + _ESTIMATE,
         zero, nought, nought + RUNNING, zero + jnp.inf,
-        jnp.zeros((0, 0), dtype),
     )  # fmt: skip
     body = lambda s: _pass(program, box, options, s)
     end = jax.lax.while_loop(lambda s: s.status == RUNNING, body, state)
     _, c = program.objective_and_residual(end.w)
-    return Solution(
-        end.w, end.y, end.zl, end.zu, end.mu, end.status, end.k, end.error, _largest(c)
-    ), end.log
+    return Solution(end.w, end.y, end.zl, end.zu, end.mu, end.status, end.k, end.error, _largest(c))
 
 
 def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
@@ -302,7 +297,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     sigma = _tree(lambda z, a, u, b: z / a + u / b, s.zl, low, s.zu, high)
     ones, zeros = _tree(jnp.ones_like, sigma), _tree(jnp.zeros_like, sigma)
     sigma = _where(estimate, zeros._replace(path=ones.path, end=ones.end), sigma)
-    system = kkt.System(nodes, ends, *hessians, sigma, box.given)
+    system = kkt.System(nodes, ends, hessians[0], hessians[1], sigma, box.given)
     gradient = _gradient(program, nodes, ends, s.w)
     pull = _pull(box, low, high, mu)
     barrier = _tree(lambda a, b: a + b, gradient, pull)
@@ -426,7 +421,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     return _State(
         new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
         jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype), alpha,
-        s.k + 1, status.astype(s.status.dtype), error_now, s.log,
+        s.k + 1, status.astype(s.status.dtype), error_now,
     )  # fmt: skip
 
 

@@ -154,7 +154,7 @@ def factorise(
     # Barrier and regularisation of the controls; those of the states apply to all support points.
     diagonal = jnp.zeros(W.shape[:3], delta.dtype)
     diagonal = diagonal.at[:, :, n : n + m].set(system.sigma.u + delta)
-    W = W + diagonal[:, :, :, None] * jnp.eye(W.shape[2], dtype=delta.dtype)
+    W = W + diagonal[..., None] * jnp.eye(W.shape[2], dtype=delta.dtype)[None, None]
     flat = lambda a: a.reshape(S, -1, a.shape[3])
     T, X = segments.T, segments.X
     H = jnp.einsum("siv,siw->svw", flat(T), flat(jnp.einsum("skab,skbv->skav", W, T)))
@@ -406,7 +406,7 @@ def solve(
 ) -> Step:
     """`apply`, refined: stiff barriers lose digits in the reduced Hessian, not in the product."""
 
-    def refine(_: int, step: Step) -> Step:
+    def refine(_: Any, step: Step) -> Step:
         got = product(program, system, factor.delta, step)
         left = jax.tree_util.tree_map(lambda a, b: a + b, load, got)
         better = apply(program, system, segments, factor, left)

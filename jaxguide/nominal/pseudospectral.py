@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal import interior_point
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
+from jaxguide.nominal.shooting import unwrap_angles
 from jaxguide.nominal.transcription import (
     Bounds,
     Primal,
@@ -43,22 +44,28 @@ class Pseudospectral(eqx.Module):
 
     **Arguments:**
 
-    - `grid`: "lgl" (the review's choice for finite horizons), "cgl", "lgr-left", "lgr-right", "lg".
+    - `grid`: "lgl" (the review's choice; for one segment: on many, its two equations at each
+      shared node cost accuracy), "cgl", "lgr-left", "lgr-right" (default) or "lg".
     - `nodes`: collocation nodes a segment. `segments`: of equal length, unless `fractions`
       (segments + 1,), from 0 to 1, places their ends.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
+    - `refinements`: how often `solve` may move or double the mesh until each segment's defect
+      between the nodes, relative to the state's span, is below `mesh_tolerance`. Under a trace
+      the mesh stays.
 
     **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
 
     **Source:** review, eqs (10)-(16), (21), (23); Waechter & Biegler (2006).
     """
 
-    grid: str = eqx.field(static=True, default="lgl")
-    nodes: int = eqx.field(static=True, default=16)
-    segments: int = eqx.field(static=True, default=4)
+    grid: str = eqx.field(static=True, default="lgr-right")
+    nodes: int = eqx.field(static=True, default=6)
+    segments: int = eqx.field(static=True, default=12)
     fractions: Any = None
     tolerance: float = eqx.field(static=True, default=1e-9)
     max_iterations: int = eqx.field(static=True, default=500)
+    refinements: int = eqx.field(static=True, default=8)
+    mesh_tolerance: float = eqx.field(static=True, default=1e-7)
     accuracy = 1e-6  # that its certificates ask for
 
     def __check_init__(self):
@@ -70,6 +77,8 @@ class Pseudospectral(eqx.Module):
             raise ValueError(f"Pseudospectral: segments is {self.segments}; give at least 1.")
         if self.max_iterations < 1:
             raise ValueError(f"Pseudospectral: max_iterations is {self.max_iterations}.")
+        if self.refinements < 0:
+            raise ValueError(f"Pseudospectral: refinements is {self.refinements}; need at least 0.")
         if not 0 < self.tolerance < 1:
             raise ValueError(f"Pseudospectral: tolerance is {self.tolerance}; give one in (0, 1).")
         collocation(self.grid, self.nodes)
@@ -88,10 +97,13 @@ class Pseudospectral(eqx.Module):
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
+        problem = _undifferentiable(problem)
         program, start = self.prepared(problem, guess)
-        options = interior_point.Options(self.tolerance, 0.1, self.max_iterations)
+        # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
+        mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
+        options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
         box = bounds(program)
-        solution, _ = interior_point.minimise(program, box, start, options)
+        solution = _one_at_a_time(program, box, start, options)
         return to_extremal(problem, program, box, solution, certifier)
 
     def prepared(self, problem: Problem, guess: Any) -> tuple[Transcription, Primal]:
@@ -107,12 +119,30 @@ class Pseudospectral(eqx.Module):
         w = straight_guess(program) if guess is None else from_extremal(program, guess)
         scale = designer_units(program, w)
         program = eqx.tree_at(lambda p: p.scale, program, scale)
-        w = Primal(
-            w.x0 / scale.x, w.x / scale.x, w.u / scale.u, w.times / scale.t, w.p / scale.p,
-            w.path, w.end,
-        )  # fmt: skip
+        w = jax.tree_util.tree_map(jnp.divide, w, program.units)
         node, end = program.values(w)
         return program, w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+
+
+@jax.custom_batching.sequential_vmap
+def _one_at_a_time(
+    program: Transcription, box: Bounds, start: Primal, options: interior_point.Options
+) -> interior_point.Solution:
+    """Under `vmap` one problem after another: batched LAPACK may hang on CPU and gains nothing."""
+    return interior_point.minimise(program, box, start, options)
+
+
+@jax.custom_jvp
+def _undifferentiable(problem: Problem) -> Problem:
+    return problem
+
+
+@_undifferentiable.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    raise NotImplementedError(
+        "Pseudospectral: solutions have no derivatives yet; for problems without bounds use "
+        "jg.Shooting, whose solutions are differentiated implicitly."
+    )
 
 
 def unit_scale(problem: Problem) -> Scale:
@@ -149,7 +179,7 @@ def straight_guess(program: Transcription) -> Primal:
     e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, size.end, dtype)
     scale = state_scale(lo, hi, x0)
 
-    def nearer(_: int, xf: Array) -> Array:
+    def nearer(_: Any, xf: Array) -> Array:
         at = lambda y: problem.endpoint_constraints(x0, xf + y * scale, t0, tf)
         e, J = at(jnp.zeros_like(xf)), jax.jacfwd(at)(jnp.zeros_like(xf))
         miss = e - jnp.clip(e, e_lo, e_hi)
@@ -162,11 +192,10 @@ def straight_guess(program: Transcription) -> Primal:
     xf = jax.lax.fori_loop(0, 8, nearer, x0) if size.end else x0
     u = start_control(program.problem, dtype)
     rule = program.rule
-    s = (
-        program.fractions[:-1, None]
-        + jnp.diff(program.fractions)[:, None] * (jnp.asarray(rule.support[1:], dtype) + 1) / 2
+    s = program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * jnp.asarray(
+        (rule.support[None, 1:] + 1) / 2, dtype
     )
-    x = x0 + s[:, :, None] * (xf - x0)
+    x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
     p = [jnp.asarray(start_value(v), dtype) for v in parameters(program.problem)]
     return Primal(
         x0,
@@ -179,15 +208,23 @@ def straight_guess(program: Transcription) -> Primal:
     )
 
 
+def fractions_at(program: Transcription, tau: np.ndarray) -> Float[Array, "segment k"]:
+    """Where in the horizon the points `tau` of every segment are."""
+    local = jnp.asarray((tau[None] + 1) / 2, program.fractions.dtype)
+    return program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * local
+
+
 def from_extremal(program: Transcription, guess: Extremal) -> Primal:
     """States and controls of `guess` at this mesh's times. In user units."""
     size, rule, dtype = program.sizes, program.rule, program.fractions.dtype
     t0, tf = guess.t[0], guess.t[-1]
-    tau = lambda a: jnp.asarray(a, dtype)
     at = lambda a: (
         t0
         + (tf - t0)
-        * (program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * (tau(a) + 1) / 2)
+        * (
+            program.fractions[:-1, None]
+            + jnp.diff(program.fractions)[:, None] * (tau(a)[None] + 1) / 2
+        )
     )
     fill = lambda y: jnp.concatenate(
         [y, jnp.zeros((*y.shape[:-1], size.n - y.shape[-1]), dtype)], axis=-1
@@ -226,7 +263,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)
     scale = program.scale._replace(x=x, u=u, t=t, p=p)
     program = eqx.tree_at(lambda q: q.scale, program, scale)
-    scaled = w._replace(x0=w.x0 / x, x=w.x / x, u=w.u / u, times=w.times / t, p=w.p / p)
+    scaled = jax.tree_util.tree_map(jnp.divide, w, program.units)
     nodes, ends = program.derivatives(scaled)
     n = size.n
     rows = jnp.max(jnp.abs(nodes.jacobian), axis=(0, 1, 3), initial=0.0)
@@ -253,7 +290,7 @@ def to_extremal(
 ) -> Extremal:
     """User units; costates by the covector mapping theorem (eqs 23-25)."""
     size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
-    dtype, n, S = program.fractions.dtype, size.n, size.segments
+    dtype, n = program.fractions.dtype, size.n
     support = program.support(w)
     whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
     t_support = node_times(program, w, rule.support)
@@ -262,17 +299,31 @@ def to_extremal(
     to_user = scale.objective / scale.x
     # Controls and multipliers live at the nodes; the ends that are none, extrapolate them.
     spread = extrapolation(program)
-    u = jnp.einsum("pk,skm->spm", spread, w.u)
+    at_nodes = node_times(program, w, rule.nodes).reshape(-1)
+    x_nodes = support[:, rule.first : rule.first + size.nodes].reshape(-1, n) * scale.x[None]
+    turned = unwrap_angles(
+        problem, at_nodes, x_nodes[:, : problem.n], w.u.reshape(-1, size.m) * scale.u[None]
+    )
     u_lo, u_hi = box.lo.u[0, 0], box.hi.u[0, 0]
-    u = jnp.clip(u, u_lo, u_hi)
+    unbounded = jnp.isinf(u_lo) & jnp.isinf(u_hi)
+    turned = jnp.where(unbounded[None, None], (turned / scale.u[None]).reshape(w.u.shape), w.u)
+    u = jnp.einsum("pk,skm->spm", spread, turned)
+    u = jnp.clip(u, u_lo[None, None], u_hi[None, None])
     rate = jnp.diff(program.fractions) * (w.times[1] - w.times[0]) / 2  # dt/dtau, scaled
-    weight = jnp.asarray(rule.w, dtype)[None, :, None] * rate[:, None, None] * scale.t
-    over_nodes = lambda a: whole(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
-    state = jnp.zeros((S, size.after + 1, n), dtype)
-    net = solution.zu.x - solution.zl.x
+    clock = rate[:, None, None] * scale.t
+    weight = jnp.asarray(rule.w, dtype)[None, :, None] * clock
+    # A break belongs to the segment that has it as a node: the one before it, for "lgr-right".
+    ahead = lambda a: jnp.concatenate([a[0, :1], jnp.concatenate(a[:, 1:])])
+    owned = ahead if rule.first else whole
+    over_nodes = lambda a: owned(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
+    # Multipliers of state bounds live at the support points; one that is no node has no weight of
+    # its own, and takes the least.
     own = slice(rule.first, rule.first + size.nodes)
-    state = state.at[:, 1:].set(net)
-    state = over_nodes(state[:, own]) / scale.x
+    weights = np.full(len(rule.support), rule.w.min())
+    weights[own] = rule.w
+    net = jnp.pad(solution.zu.x - solution.zl.x, ((0, 0), (1, 0), (0, 0)))
+    state = ahead(net / (jnp.asarray(weights, dtype)[None, :, None] * clock))
+    state = state * (scale.objective / scale.x)[None]
     status = solution.status
     result = RESULTS.where(
         status == interior_point.CONVERGED, RESULTS.successful, RESULTS.optimiser_stopped
@@ -284,19 +335,19 @@ def to_extremal(
     f, _ = program.objective_and_residual(w)
     return Extremal(
         t=t,
-        x=whole(support)[:, :k] * scale.x[:k],
-        u=whole(u) * scale.u,
+        x=whole(support)[:, :k] * scale.x[None, :k],
+        u=whole(u) * scale.u[None],
         reference_nodes=jnp.asarray(rule.support, dtype),
-        u_before=u[:, -1] * scale.u,
-        costate=whole(lam)[:, :k] * to_user[:k],
-        costate_before=before[:, :k] * to_user[:k],
+        u_before=u[:, -1] * scale.u[None],
+        costate=whole(lam)[:, :k] * to_user[None, :k],
+        costate_before=before[:, :k] * to_user[None, :k],
         final_time=w.times[1] * scale.t,
         objective=f * scale.objective,
         multipliers=Multipliers(
             (solution.y.end * scale.objective / scale.end)[:q],
-            over_nodes(solution.y.path) / scale.path,
+            over_nodes(solution.y.path) / scale.path[None],
             state[:, :k],
-            over_nodes(solution.zu.u - solution.zl.u) / scale.u,
+            over_nodes(solution.zu.u - solution.zl.u) / scale.u[None],
         ),
         result=result,
         residual=solution.violation,

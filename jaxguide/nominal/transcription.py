@@ -124,6 +124,13 @@ class Transcription(eqx.Module):
         row = lambda s: jnp.stack([1 - s, s], axis=-1)
         return jnp.stack([row(self.fractions[:-1]), row(self.fractions[1:])], axis=1)
 
+    @property
+    def units(self) -> Primal:
+        """What one of each unknown is in user units."""
+        s = self.scale
+        nodal = lambda a: a[None, None]
+        return Primal(s.x, nodal(s.x), nodal(s.u), s.t[None], s.p, nodal(s.path), s.end)
+
     def starts(self, w: Primal) -> Float[Array, "segment n"]:
         """State at the start of every segment."""
         return jnp.concatenate([w.x0[None], w.x[:-1, -1]])
@@ -170,7 +177,7 @@ class Transcription(eqx.Module):
         rule, dtype = self.rule, self.fractions.dtype
         return jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.w, dtype)
 
-    def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " out"]]:
+    def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
         over = jax.vmap(jax.vmap(self.node), in_axes=(None, None, 0))
         return over(*self._taus, self.inputs(w)), self.end(self.end_inputs(w))
 
@@ -199,7 +206,9 @@ class Transcription(eqx.Module):
         f = -jnp.einsum("rk,srn->skn", B, y.defect)
         return jnp.concatenate([f, jnp.ones_like(f[:, :, :1]), y.path], axis=2)
 
-    def hessians(self, w: Primal, y: Dual) -> tuple[Float[Array, "segment node in in"], Array]:
+    def hessians(
+        self, w: Primal, y: Dual
+    ) -> tuple[Float[Array, "segment node in in"], Float[Array, "end end"]]:
         """Second derivatives of the Lagrangian, node by node, and of its endpoint part."""
         weights = self.node_weights(y)
         node = lambda tau, w, q, c: jnp.dot(c, self.node(tau, w, q))
@@ -325,7 +334,9 @@ def bounds(program: Transcription) -> Bounds:
     number = lambda v: jnp.asarray(v, dtype)
 
     def scalar(entry: Any) -> tuple[Array, Array]:
-        return (number(entry.lo), number(entry.hi)) if is_free(entry) else (number(entry),) * 2
+        if is_free(entry):
+            return number(entry.lo), number(entry.hi)
+        return number(entry), number(entry)
 
     states = bounds_of(problem.state_bounds, size.n, dtype)
     start = initial_values(problem, dtype)
@@ -364,4 +375,4 @@ def node_times(program: Transcription, w: Primal, at: np.ndarray) -> Float[Array
     """User times of the points `at` (tau) of every segment."""
     tau = jnp.asarray(at, program.fractions.dtype)
     ends = program.clocks @ w.times * program.scale.t
-    return (ends[:, :1] * (1 - tau) + ends[:, 1:] * (1 + tau)) / 2
+    return (ends[:, :1] * (1 - tau)[None] + ends[:, 1:] * (1 + tau)[None]) / 2

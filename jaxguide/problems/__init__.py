@@ -3,6 +3,7 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from jaxguide.problems.reference import Reference
 from jaxguide.types import UnknownName
 
 if TYPE_CHECKING:
@@ -69,14 +70,29 @@ def describe(name: str) -> str:
     return (getattr(_module(name), _LIBRARY[name][1]).__doc__ or "").strip().splitlines()[0]
 
 
+def reference(name: str) -> Reference:
+    """What is known of its optimum."""
+    return getattr(_module(name), _LIBRARY[name][1]).reference
+
+
 def mission(name: str, **options: Any) -> "Mission":
     """The problem's own closed loop."""
-    return _module(name).mission(**options)
+    return _offered(name, "mission")(**options)
 
 
 def dispersions(name: str) -> dict[str, Any]:
     """The dispersions its sweep draws by default."""
-    return _module(name).dispersions()
+    return _offered(name, "dispersions")()
+
+
+def _offered(name: str, what: str) -> Any:
+    if not hasattr(_module(name), what):
+        have = [k for k in _LIBRARY if hasattr(_module(k), what)]
+        raise ValueError(
+            f"problem {name!r} has no {what} of its own; {', '.join(have)} does. In Python, build a "
+            "jg.Mission from any extremal."
+        )
+    return getattr(_module(name), what)
 
 
 def __getattr__(name: str) -> Any:

@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import ArrayLike
 
 from jaxguide.problem import Free, Problem
 from jaxguide.problems.reference import Reference
@@ -56,7 +55,7 @@ _CAPACITY = ((5.85 - 0.02) / 0.00873) ** 1.5
 class Tumour(Problem):
     """Anti-angiogenic treatment with a bounded total dose: the smallest final tumour."""
 
-    growth: ArrayLike = 0.084
+    growth: Any = 0.084
     state_names = ("p", "q", "dose")
     control_names = ("rate",)
     initial_state = (_CAPACITY / 2, _CAPACITY / 4, 0.0)

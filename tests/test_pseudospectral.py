@@ -1,0 +1,243 @@
+"""Direct solutions: the Newton step against dense algebra, closed forms, covectors, failures."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DoubleIntegrator, FreeTime
+from jax.flatten_util import ravel_pytree
+
+import jaxguide as jg
+from jaxguide import problems
+from jaxguide.nominal import kkt
+from jaxguide.nominal.interior_point import CONVERGED, _gradient
+from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
+from jaxguide.nominal.refinement import moved
+from jaxguide.nominal.transcription import Dual, Primal, Scale, Transcription
+from jaxguide.problems import EarthMars
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_defects_of_polynomials_vanish(family):
+    rule = collocation(family, 7)
+    c = np.random.default_rng(0).normal(size=len(rule.main) if family == "lg" else 7)
+    x = np.polynomial.polynomial.polyval(rule.support, c)
+    f = np.polynomial.polynomial.polyval(rule.nodes, np.polynomial.polynomial.polyder(c))
+    # Differentiation matrices of 8 points hold rounding times N^2.
+    np.testing.assert_allclose(rule.A @ x - rule.B @ f, 0, atol=1e-12)
+    assert np.isclose(rule.w.sum(), 2, rtol=1e-14)
+
+
+def test_left_null_vector_of_lgl_is_w_times_legendre():
+    rule = collocation("lgl", 9)
+    v = left_null("lgl", 9)
+    wanted = rule.w * np.polynomial.legendre.legval(rule.nodes, np.eye(9)[8])
+    np.testing.assert_allclose(v / v[0], wanted / wanted[0], rtol=1e-11)
+    np.testing.assert_allclose(v @ rule.A, 0, atol=1e-13)
+
+
+class Everything(EarthMars):
+    """Free times, a free initial component, a static parameter, two path constraints."""
+
+    thrust: object = jg.Free(0.1, 0.2, 0.14)
+    final_time = jg.Free(1.0, 5.0, 3.0)
+    initial_state = (1.0, 0.0, jg.Free(0.5, 2.0))
+    path_bounds = (-1.0, 4.0)
+
+    def path_constraints(self, t, x, u):
+        return jnp.stack([x[0] * u[0], x[1] + u[0] ** 2])
+
+
+@pytest.mark.parametrize(("family", "segments", "points"), [("lgl", 2, 5), ("lg", 2, 4)])
+def test_newton_step_against_dense_algebra(family, segments, points):
+    scale = Scale(
+        jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5]), jnp.asarray(2.0), jnp.array([0.1]),
+        jnp.array([1.0, 2.0]), jnp.array([1.0, 3.0]), jnp.asarray(0.7),
+    )  # fmt: skip
+    fractions = jnp.linspace(0.0, 1.0, segments + 1) ** 1.2
+    program = Transcription(Everything(), scale, fractions, family, points)
+    size, rng = program.sizes, np.random.default_rng(0)
+    r = lambda *shape: jnp.asarray(rng.normal(size=shape)) * 0.1
+    random = lambda tree: jax.tree_util.tree_map(lambda a: r(*a.shape), tree)
+    w = Primal(
+        jnp.array([1.0, 0.0, 0.4]), jnp.array([[[1.0, 0.0, 0.3]]]) + r(segments, size.after, 3),
+        1 + r(segments, points, 1), jnp.array([0.0, 1.6]) + r(2), jnp.array([1.4]),
+        r(segments, points, 2), r(2),
+    )  # fmt: skip
+    y = Dual(10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(2))
+    sigma, pull = jax.tree_util.tree_map(lambda a: jnp.abs(a) + 0.3, random(w)), random(w)
+    no = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, bool), w)
+    given = no._replace(
+        x0=jnp.array([True, True, False]), times=jnp.array([True, False]),
+        end=jnp.array([True, False]),
+    )  # fmt: skip
+    delta = jnp.asarray(3.0)
+
+    @jax.jit
+    def structured():
+        nodes, ends = program.derivatives(w)
+        _, c = program.objective_and_residual(w)
+        system = kkt.System(nodes, ends, *program.hessians(w, y), sigma, given)
+        parts = kkt.eliminate(program, system)
+        factor, ok = kkt.factorise(program, system, parts, delta, jnp.asarray(5.0))
+        force = jax.tree_util.tree_map(jnp.add, _gradient(program, nodes, ends, w), pull)
+        load = kkt.Load(force, c._replace(path=c.path + kkt.COMPLIANCE * y.path))
+        return kkt.solve(program, system, parts, factor, load), ok
+
+    flat, unravel = ravel_pytree(w)
+    objective = lambda v: program.objective_and_residual(unravel(v))[0]
+    constraints = lambda v: ravel_pytree(program.objective_and_residual(unravel(v))[1])[0]
+    y_flat, y_back = ravel_pytree(y)
+
+    @jax.jit
+    def dense():
+        lagrangian = lambda v: objective(v) + jnp.dot(y_flat, constraints(v))
+        return (
+            jax.hessian(lagrangian)(flat), jax.jacfwd(constraints)(flat),
+            jax.grad(objective)(flat), constraints(flat),
+        )  # fmt: skip
+
+    H, A, g, c = (np.asarray(a) for a in dense())
+    slack = np.asarray(ravel_pytree(no._replace(path=~no.path, end=~no.end))[0])
+    diagonal = np.asarray(ravel_pytree(sigma)[0]) + np.where(slack, 0, delta)
+    soft = y_back(jnp.zeros_like(y_flat))._replace(path=jnp.full(y.path.shape, kkt.COMPLIANCE))
+    soft = np.asarray(ravel_pytree(soft)[0])
+    K = np.block([[H + np.diag(diagonal), A.T], [A, -np.diag(soft)]])
+    rhs = -np.concatenate([g + np.asarray(ravel_pytree(pull)[0]), c + soft * np.asarray(y_flat)])
+    keep = np.concatenate([~np.asarray(ravel_pytree(given)[0]), np.ones(len(c), bool)])
+    wanted = np.zeros(len(rhs))
+    wanted[keep] = np.linalg.solve(K[np.ix_(keep, keep)], rhs[keep])
+    step, ok = structured()
+    assert bool(ok) == (np.sum(np.linalg.eigvalsh(K[np.ix_(keep, keep)]) < 0) == len(c))
+    got = np.concatenate([ravel_pytree(step.primal)[0], ravel_pytree(step.dual)[0]])
+    # Condition number 1e4 to 1e7 times rounding, relative to the largest entry.
+    np.testing.assert_allclose(got, wanted, atol=1e-9 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(("grid", "nodes", "segments"), [("lgl", 9, 1), ("lgr-right", 5, 3)])
+def test_double_integrator(grid, nodes, segments):
+    e = jg.solve(DoubleIntegrator(), jg.Pseudospectral(grid, nodes, segments, refinements=0))
+    t = np.asarray(e.t)
+    np.testing.assert_allclose(e.objective, 6, rtol=1e-12)
+    # Cubic states are exact in both; costates to rounding over the least weight.
+    np.testing.assert_allclose(e.x[:, 0], 3 * t**2 - 2 * t**3, atol=1e-11)
+    np.testing.assert_allclose(e.u[:, 0], 6 - 12 * t, atol=1e-9)
+    wanted = np.stack([np.full_like(t, -12), 12 * t - 6], axis=1)
+    np.testing.assert_allclose(e.costate, wanted, atol=1e-8)
+    assert np.all(e.certificate.passed), str(e.certificate)
+
+
+def test_free_final_time():
+    e = jg.solve(FreeTime(), jg.Pseudospectral("lg", 6, 2))
+    np.testing.assert_allclose(e.final_time, 18**0.25, rtol=1e-9)
+    assert np.all(e.certificate.passed), str(e.certificate)
+
+
+def test_state_constraint_has_a_multiplier_of_the_right_sign():
+    # By default, since there are bounds. Two touches or a boundary arc of x <= 1/9: J = 4.
+    problem = problems.get("bryson-denham")
+    e = jg.solve(problem, jg.Pseudospectral(refinements=0))
+    np.testing.assert_allclose(e.objective, 4, rtol=1e-6)
+    assert np.all(np.asarray(e.x[:, 0]) <= 1 / 9 + 1e-8)
+    held = np.asarray(e.multipliers.state)
+    assert held[:, 0].max() > 1 and held.min() > -1e-4
+
+
+def test_earth_mars_against_shooting(earth_mars):
+    method = jg.Pseudospectral(nodes=12, segments=6, refinements=0)
+    e = jg.solve(EarthMars(), method)
+    # 2.9e-8 is what the mesh leaves; costates are as good as their dual problem's resolution.
+    np.testing.assert_allclose(e.objective, earth_mars.objective, atol=1e-7)
+    off = np.abs(np.asarray(e.costate) - np.asarray(earth_mars(e.t).costate))
+    assert off.max() < 1e-5
+    again = jg.solve(EarthMars(), method, guess=earth_mars)
+    np.testing.assert_allclose(again.objective, e.objective, rtol=1e-9)
+    lanes = jax.jit(
+        jax.vmap(lambda k: jg.solve(dataclasses.replace(EarthMars(), thrust=k), method).objective)
+    )(jnp.array([0.1405, 0.141]))
+    np.testing.assert_allclose(lanes[0], e.objective, rtol=1e-9)
+    # d r_f/d thrust = 3.5434 (reference/earth_mars.json), and its curvature over 5e-4.
+    np.testing.assert_allclose((lanes[0] - lanes[1]) / 5e-4, 3.5434, atol=2e-3)
+
+
+def test_contradictory_ends_are_infeasible():
+    class Torn(DoubleIntegrator):
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return jnp.stack([xf[0] - 1.0, xf[0] - 2.0])
+
+    method = jg.Pseudospectral(nodes=4, segments=2)
+    e = jg.solve(Torn(), method, throw=False)
+    assert not bool(e.result == jg.RESULTS.successful)
+    with pytest.raises(jg.SolveError, match=r"Endpoint constraint \d misses"):
+        jg.solve(Torn(), method)
+
+
+def test_derivatives_are_refused_in_words():
+    solve = lambda k: jg.solve(
+        dataclasses.replace(DoubleIntegrator(), k=k), jg.Pseudospectral(nodes=4, segments=2)
+    )
+    with pytest.raises(NotImplementedError, match="jg.Shooting"):
+        jax.grad(lambda k: solve(k).objective)(1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"grid": "uniform"}, "grid is 'uniform'; choose one of lgl"),
+        ({"nodes": 1}, "needs at least 2"),
+        ({"segments": 0}, "segments is 0"),
+        ({"tolerance": 2.0}, "tolerance is 2.0"),
+        ({"refinements": -1}, "refinements is -1"),
+        ({"max_iterations": 0}, "max_iterations is 0"),
+    ],
+)
+def test_bad_options(options, words):
+    with pytest.raises(ValueError, match=words):
+        jg.Pseudospectral(**options)
+
+
+def test_infinite_horizon_is_refused():
+    problem = dataclasses.replace(problems.get("scalar-regulator"), final_time=np.inf)
+    with pytest.raises(ValueError, match="final_time is infinite"):
+        jg.solve(problem, jg.Pseudospectral())
+
+
+def test_moved_mesh_goes_where_the_error_is():
+    fractions, errors = np.linspace(0, 1, 11), np.full(10, 1e-9)
+    errors[3] = 1e-2
+    new = moved(fractions, errors, 10)
+    assert new[0] == 0 and new[-1] == 1 and np.all(np.diff(new) > 0)
+    inside = np.sum((new > 0.3) & (new < 0.4))
+    assert inside >= 6
+
+
+# What a fixed mesh of 12 segments of 6 Radau nodes leaves, from a straight line as guess:
+# (relative error of the objective allowed). None: the mesh is too coarse to say anything.
+LIBRARY = {
+    "bryson-denham": 1e-6, "beam": 1e-4, "two-thrusters": 1e-6, "robbins": 1e-2,
+    "brachistochrone": 1e-9, "brachistochrone-dymos": 1e-9, "brachistochrone-wall": 1e-6,
+    "linear-tangent-steering": 1e-9, "hanging-chain": 1e-9, "isoperimetric": 1e-8,
+    "hypersensitive": None, "rayleigh": 1e-6, "van-der-pol": 1e-8, "fuller": 1e-3,
+    "singular5": 1e-3, "catalyst-mixing": 1e-4, "jackson": 1e-5, "tumour": 1e-5,
+    "moon-lander": 1e-5, "goddard": 1e-4, "goddard-speed-limit": 1e-4, "robot-arm": 1e-4,
+    "free-flying-robot": 1e-3, "hang-glider": 1e-4, "shuttle-reentry": 1e-6,
+    "shuttle-reentry-heat": 1e-3, "earth-mars": 1e-6, "double-integrator": 1e-12,
+    "free-end-velocity": 1e-12, "scalar-regulator": 1e-12, "weighted-regulator": 1e-12,
+}  # fmt: skip
+
+
+def test_every_problem_of_the_library_is_tried():
+    assert set(LIBRARY) == set(problems.names())
+    assert CONVERGED == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LIBRARY)
+def test_library_from_a_straight_line(name):
+    problem = problems.get(name)
+    e = jg.solve(problem, jg.Pseudospectral(refinements=0))
+    if LIBRARY[name] is not None:
+        value = problems.reference(name).value
+        np.testing.assert_allclose(e.objective, value, rtol=LIBRARY[name])
