@@ -192,9 +192,7 @@ def straight_guess(program: Transcription) -> Primal:
     xf = jax.lax.fori_loop(0, 8, nearer, x0) if size.end else x0
     u = start_control(program.problem, dtype)
     rule = program.rule
-    s = program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * jnp.asarray(
-        (rule.support[None, 1:] + 1) / 2, dtype
-    )
+    s = fractions_at(program, rule.support[1:])
     x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
     p = [jnp.asarray(start_value(v), dtype) for v in parameters(program.problem)]
     return Primal(
@@ -218,14 +216,7 @@ def from_extremal(program: Transcription, guess: Extremal) -> Primal:
     """States and controls of `guess` at this mesh's times. In user units."""
     size, rule, dtype = program.sizes, program.rule, program.fractions.dtype
     t0, tf = guess.t[0], guess.t[-1]
-    at = lambda a: (
-        t0
-        + (tf - t0)
-        * (
-            program.fractions[:-1, None]
-            + jnp.diff(program.fractions)[:, None] * (tau(a)[None] + 1) / 2
-        )
-    )
+    at = lambda tau: t0 + (tf - t0) * fractions_at(program, tau)
     fill = lambda y: jnp.concatenate(
         [y, jnp.zeros((*y.shape[:-1], size.n - y.shape[-1]), dtype)], axis=-1
     )

@@ -89,8 +89,8 @@ def _offered(name: str, what: str) -> Any:
     if not hasattr(_module(name), what):
         have = [k for k in _LIBRARY if hasattr(_module(k), what)]
         raise ValueError(
-            f"problem {name!r} has no {what} of its own; {', '.join(have)} does. In Python, build a "
-            "jg.Mission from any extremal."
+            f"problem {name!r} has no {what} of its own; {', '.join(have)} does. In Python, build "
+            "a jg.Mission from any extremal."
         )
     return getattr(_module(name), what)
 
