@@ -124,7 +124,7 @@ def inside(box: _Box, w: Primal, push: Any) -> Primal:
     return _tree(one, w, box.lo, box.hi, box.below, box.above, box.given)
 
 
-def _gaps(box: _Box, w: Primal) -> tuple[Primal, Primal]:
+def distances(box: _Box, w: Primal) -> tuple[Primal, Primal]:
     """Distances to the bounds, 1 where there is none."""
     low = _tree(
         lambda w, b, on: jnp.where(on, w - jnp.where(on, b, 0.0), 1.0), w, box.lo, box.below
@@ -158,14 +158,14 @@ def _count(tree: Any) -> int:
 
 def _barrier(box: _Box, w: Primal, mu: Array) -> Array:
     """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
-    low, high = _gaps(box, w)
+    low, high = distances(box, w)
     inside = lambda a: jnp.where(a > 0, a, jnp.nan)
     logs = _total(_tree(lambda a, b: jnp.log(inside(a)) + jnp.log(inside(b)), low, high))
     one = lambda a, b, l, h: _KAPPA_D * (jnp.where(l & ~h, a, 0.0) + jnp.where(h & ~l, b, 0.0))
     return mu * (_total(_tree(one, low, high, box.below, box.above)) - logs)
 
 
-def _pull(box: _Box, low: Primal, high: Primal, mu: Array) -> Primal:
+def barrier_gradient(box: _Box, low: Primal, high: Primal, mu: Array) -> Primal:
     """Gradient of `_barrier`."""
 
     def one(a: Array, b: Array, l: Array, h: Array) -> Array:
@@ -232,7 +232,7 @@ def optimality_error(
 
     gradient = _tree(lambda g, a, b: g - a + b, jax.grad(lagrangian)(w), zl, zu)
     gradient = _tree(lambda g, given: jnp.where(given, 0.0, g), gradient, box.given)
-    low, high = _gaps(box, w)
+    low, high = distances(box, w)
     z = _total(zl) + _total(zu)
     duals = _total(_tree(jnp.abs, y)) + z
     s_d = jnp.maximum(_S_MAX, duals / (_count(y) + 2 * _count(w))) / _S_MAX
@@ -251,7 +251,7 @@ def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Opt
     dtype = program.fractions.dtype
     w = inside(box, start, options.push)
     mu = jnp.asarray(options.mu, dtype)
-    low, high = _gaps(box, w)
+    low, high = distances(box, w)
     zl = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), low, box.below)
     zu = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), high, box.above)
     _, c = program.objective_and_residual(w)
@@ -277,7 +277,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     newton, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
     nodes, ends = program.derivatives(s.w)
     f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
-    low, high = _gaps(box, s.w)
+    low, high = distances(box, s.w)
     error = lambda mu: optimality_error(program, box, s.w, s.y, s.zl, s.zu, c, mu)
     error_now = error(jnp.zeros_like(s.mu))
     done = newton & (error_now <= options.tolerance)
@@ -298,8 +298,8 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     ones, zeros = _tree(jnp.ones_like, sigma), _tree(jnp.zeros_like, sigma)
     sigma = _where(estimate, zeros._replace(path=ones.path, end=ones.end), sigma)
     system = kkt.System(nodes, ends, hessians[0], hessians[1], sigma, box.given)
-    gradient = _gradient(program, nodes, ends, s.w)
-    pull = _pull(box, low, high, mu)
+    gradient = objective_gradient(program, nodes, ends, s.w)
+    pull = barrier_gradient(box, low, high, mu)
     barrier = _tree(lambda a, b: a + b, gradient, pull)
     bare = _tree(lambda g, a, b: g - a + b, gradient, s.zl, s.zu)
     force = _where(estimate, bare, _where(restore, pull, barrier))
@@ -390,7 +390,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     dzu = _tree(lambda z, a, d, on: rate(z, a, d, on, -1.0), s.zu, high, d, box.above)
     alpha_z = jnp.minimum(_longest_dual(s.zl, dzl, tau), _longest_dual(s.zu, dzu, tau))
     w = _move(s.w, alpha, d)
-    low, high = _gaps(box, w)
+    low, high = distances(box, w)
     keep = lambda z, a, on: jnp.where(
         on, jnp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
     )
@@ -425,7 +425,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     )  # fmt: skip
 
 
-def _gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal) -> Primal:
+def objective_gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal) -> Primal:
     """Of the objective."""
     on_support = jnp.zeros_like(program.support(w))
     n = program.sizes.n

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal import interior_point
+from jaxguide.nominal.implicit import sensitivity
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
 from jaxguide.nominal.shooting import unwrap_angles
 from jaxguide.nominal.transcription import (
@@ -97,14 +98,14 @@ class Pseudospectral(eqx.Module):
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
-        problem = _undifferentiable(problem)
-        program, start = self.prepared(problem, guess)
+        program, start = jax.lax.stop_gradient(self.prepared(problem, guess))
         # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
         mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
-        box = bounds(program)
-        solution = _one_at_a_time(program, box, start, options)
-        return to_extremal(problem, program, box, solution, certifier)
+        whole = with_integrals(problem)
+        solution = _solved(whole, program, start, options)
+        program = eqx.tree_at(lambda p: p.problem, program, whole)
+        return to_extremal(problem, program, bounds(program), solution, certifier)
 
     def prepared(self, problem: Problem, guess: Any) -> tuple[Transcription, Primal]:
         """The transcription in designer units, and where the search starts."""
@@ -132,17 +133,22 @@ def _one_at_a_time(
     return interior_point.minimise(program, box, start, options)
 
 
-@jax.custom_jvp
-def _undifferentiable(problem: Problem) -> Problem:
-    return problem
+@eqx.filter_custom_jvp
+def _solved(
+    problem: Problem, program: Transcription, start: Primal, options: interior_point.Options
+) -> interior_point.Solution:
+    """The solution for `problem` in the units and on the mesh of `program`."""
+    program = eqx.tree_at(lambda p: p.problem, program, problem)
+    return _one_at_a_time(program, bounds(program), start, options)
 
 
-@_undifferentiable.defjvp
+@_solved.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
-    raise NotImplementedError(
-        "Pseudospectral: solutions have no derivatives yet; for problems without bounds use "
-        "jg.Shooting, whose solutions are differentiated implicitly."
-    )
+    """The implicit function theorem on the conditions that the optimiser met, never its steps."""
+    problem, program, start, options = primals
+    solution = _solved(problem, program, start, options)
+    program = eqx.tree_at(lambda p: p.problem, program, problem)
+    return solution, sensitivity(program, solution, tangents[0])
 
 
 def unit_scale(problem: Problem) -> Scale:
