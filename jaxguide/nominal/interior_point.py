@@ -44,10 +44,10 @@ RUNNING, CONVERGED, INFEASIBLE, TOO_MANY, STALLED = 0, 1, 2, 3, 4
 class Options(NamedTuple):
     """Runtime arguments: changing them compiles nothing."""
 
-    tolerance: Any = 1e-9
-    mu: Any = 0.1
-    max_iterations: Any = 300
-    push: Any = 1e-2  # how far from the bounds to start, relative to them and to their distance
+    tolerance: Any
+    mu: Any
+    max_iterations: Any
+    push: Any  # how far from the bounds to start, relative to them and to their distance
 
 
 class Solution(NamedTuple):
@@ -82,7 +82,6 @@ class _State(NamedTuple):
     theta_entry: Array  # violation at which restoration began
     delta: Array  # last regularisation that was needed
     mode: Array
-    alpha: Array
     k: Array
     status: Array
     error: Array
@@ -159,8 +158,8 @@ def _count(tree: Any) -> int:
 def _barrier(box: _Box, w: Primal, mu: Array) -> Array:
     """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
     low, high = distances(box, w)
-    inside = lambda a: jnp.where(a > 0, a, jnp.nan)
-    logs = _total(_tree(lambda a, b: jnp.log(inside(a)) + jnp.log(inside(b)), low, high))
+    log = lambda a: jnp.log(jnp.where(a > 0, a, jnp.nan))
+    logs = _total(_tree(lambda a, b: log(a) + log(b), low, high))
     one = lambda a, b, l, h: _KAPPA_D * (jnp.where(l & ~h, a, 0.0) + jnp.where(h & ~l, b, 0.0))
     return mu * (_total(_tree(one, low, high, box.below, box.above)) - logs)
 
@@ -263,8 +262,7 @@ def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Opt
         w, y, zl, zu, mu,
         _Filter(slots, slots, nought),
         1e4 * jnp.maximum(1.0, theta), 1e-4 * jnp.maximum(1.0, theta), theta,
-        zero, nought + _ESTIMATE,
-        zero, nought, nought + RUNNING, zero + jnp.inf,
+        zero, nought + _ESTIMATE, nought, nought + RUNNING, zero + jnp.inf,
     )  # fmt: skip
     body = lambda s: _pass(program, box, options, s)
     end = jax.lax.while_loop(lambda s: s.status == RUNNING, body, state)
@@ -325,6 +323,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
         lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False))
     )
     delta_last = jnp.where(regular & ~flat & (delta > 0), delta, s.delta)
+
     # The filter line search: the full step, then its second-order correction, then halves.
     phi_of = lambda f, w: f + _barrier(box, w, mu)
     theta, phi = _norm1(c), phi_of(f, s.w)
@@ -362,7 +361,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
         return k + 1, target, first, (step, length), ok, f_type, again
 
     target = _where(estimate, _tree(jnp.zeros_like, c), c)
-    none = (kkt.Step(zeros, _tree(jnp.zeros_like, s.y)), jnp.ones_like(s.alpha))
+    none = (kkt.Step(zeros, _tree(jnp.zeros_like, s.y)), jnp.ones_like(s.mu))
     no, yes = jnp.array(False), jnp.array(True)
     _, _, (step, longest), latest, full, f_type, _ = jax.lax.while_loop(
         lambda a: a[-1], aim, (0, target, none, none, no, no, yes)
@@ -420,7 +419,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)
     return _State(
         new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
-        jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype), alpha,
+        jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
         s.k + 1, status.astype(s.status.dtype), error_now,
     )  # fmt: skip
 

@@ -65,7 +65,7 @@ class Scale(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """First and second derivatives of (dt/dtau f, w dt/dtau F, h) at every node, with respect to
+    """(dt/dtau f, w dt/dtau F, h) at every node, and first derivatives, with respect to
     (x, u, t_a, t_b, p): the ends of the node's segment and the static parameters."""
 
     value: Float[Array, "segment node out"]
