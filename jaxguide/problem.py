@@ -129,6 +129,33 @@ class Problem(eqx.Module):
         return type(self).optimal_control is not Problem.optimal_control
 
 
+_BOUNDARY = ("initial_time", "final_time", "initial_state")
+
+
+def parameter_names(problem: Problem) -> tuple[str, ...]:
+    """Fields that hold a `Free` static parameter, for the solver to choose."""
+    return tuple(
+        f.name
+        for f in dataclasses.fields(problem)
+        if f.name not in _BOUNDARY and is_free(getattr(problem, f.name))
+    )
+
+
+def with_parameters(problem: Problem, p: Any) -> Problem:
+    """`problem` with the numbers `p` (None: where a search starts) for its `Free` fields."""
+    names = parameter_names(problem)
+    if not names:
+        return problem  # itself, and not a copy
+    if p is None:
+        p = [as_float(start_value(getattr(problem, k))) for k in names]
+    return replace_parameters(problem, names, p)
+
+
+def replace_parameters(problem: Problem, names: tuple[str, ...], values: Any) -> Problem:
+    """`problem` with scalar fields `names` set to the entries of `values`."""
+    return dataclasses.replace(problem, **{name: values[i] for i, name in enumerate(names)})
+
+
 def with_array_leaves(problem: Problem) -> Problem:
     """The same problem with every leaf an array, so that it passes through `jax.jit`."""
     return jax.tree_util.tree_map(jnp.asarray, problem)
@@ -198,12 +225,12 @@ def _start(problem: Problem) -> tuple[Array, ...]:
     times = (problem.initial_time, problem.final_time)
     t0, tf = (jnp.asarray(start_value(t), dtype) for t in times)
     x0, u0 = initial_values(problem, dtype), start_control(problem, dtype)
-    return t0, tf, x0, u0, problem.dynamics(t0, x0, u0)
+    return t0, tf, x0, u0, with_parameters(problem, None).dynamics(t0, x0, u0)
 
 
 def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: Any) -> tuple:
     try:
-        out = jax.eval_shape(getattr(problem, name), *args)
+        out = jax.eval_shape(getattr(with_parameters(problem, None), name), *args)
     except Exception as e:
         raise ValueError(
             f"{type(problem).__name__}.{name} could not be evaluated with a state of "

@@ -10,8 +10,7 @@ from jaxguide.certificate import certifier
 from jaxguide.nominal.pseudospectral import Pseudospectral
 from jaxguide.nominal.refinement import refined
 from jaxguide.nominal.shooting import Shooting
-from jaxguide.nominal.transcription import BOUNDARY
-from jaxguide.problem import Problem, is_free, validate, with_array_leaves
+from jaxguide.problem import Problem, parameter_names, validate, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
@@ -57,13 +56,12 @@ def _is_unconstrained(problem: Problem) -> bool:
         return True
     infinite = lambda bounds: all(np.all(np.isinf(np.asarray(b))) for b in bounds)
     own = type(problem)
-    free = any(is_free(v) for k, v in vars(problem).items() if k not in BOUNDARY)
     return (
         infinite(problem.state_bounds)
         and infinite(problem.control_bounds)
         and own.path_constraints is Problem.path_constraints
         and own.integrands is Problem.integrands
-        and not free
+        and not parameter_names(problem)
         and bool(np.all(np.asarray(problem.endpoint_bounds[0]) == problem.endpoint_bounds[1]))
     )
 

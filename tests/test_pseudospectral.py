@@ -135,6 +135,21 @@ def test_free_final_time():
     assert np.all(e.certificate.passed), str(e.certificate)
 
 
+def test_static_parameter():
+    # J = 6/k^2 falls with k, whose bound it meets; the extremal's Problem holds the number found.
+    problem = dataclasses.replace(DoubleIntegrator(), k=jg.Free(0.5, 2.0, 1.0))
+    e = jg.solve(problem, jg.Pseudospectral(nodes=6, segments=2, refinements=0))
+    # Within 1e-9 of a relaxed bound, and mu = 1e-10 over its multiplier short of it.
+    np.testing.assert_allclose(vars(e.problem)["k"], 2.0, rtol=1e-8)
+    np.testing.assert_allclose(e.objective, 1.5, rtol=1e-8)
+    assert np.all(e.certificate.passed), str(e.certificate)
+
+
+def test_guesses_that_are_no_extremal_are_refused():
+    with pytest.raises(ValueError, match="takes an Extremal"):
+        jg.solve(DoubleIntegrator(), jg.Pseudospectral(), guess=np.ones(2))
+
+
 def test_state_constraint_has_a_multiplier_of_the_right_sign():
     # By default, since there are bounds. Two touches or a boundary arc of x <= 1/9: J = 4.
     problem = problems.get("bryson-denham")
@@ -142,6 +157,7 @@ def test_state_constraint_has_a_multiplier_of_the_right_sign():
     np.testing.assert_allclose(e.objective, 4, rtol=1e-6)
     assert np.all(np.asarray(e.x[:, 0]) <= 1 / 9 + 1e-8)
     held = np.asarray(e.multipliers.state)
+    # Elsewhere a multiplier is the last mu, 1e-10, over the distance and the weight of a node.
     assert held[:, 0].max() > 1 and held.min() > -1e-4
 
 
@@ -211,6 +227,8 @@ def test_implicit_derivatives_with_an_active_bound():
         ({"tolerance": 2.0}, "tolerance is 2.0"),
         ({"refinements": -1}, "refinements is -1"),
         ({"max_iterations": 0}, "max_iterations is 0"),
+        ({"mesh_tolerance": 0.0}, "mesh_tolerance is 0.0"),
+        ({"fractions": (0.0, 0.7, 0.3, 1.0)}, "ascend from 0 to 1"),
     ],
 )
 def test_bad_options(options, words):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.linalg import left_null_space, solve
 from jaxguide.nominal.conditions import endpoint_lagrangian
-from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free
+from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free, replace_parameters
 from jaxguide.trajectory import Extremal
 
 
@@ -26,11 +26,6 @@ class SecondVariation(NamedTuple):
     f_p: Array
     H_xp: Array
     H_up: Array
-
-
-def replace_parameters(problem: Problem, names: tuple[str, ...], values: Array) -> Problem:
-    """`problem` with scalar fields `names` set to the entries of `values`."""
-    return dataclasses.replace(problem, **{name: values[i] for i, name in enumerate(names)})
 
 
 def parameter_values(problem: Problem, names: tuple[str, ...], dtype: Any) -> Float[Array, " p"]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxguide.spectral import grid
+from jaxguide.spectral.grids import differentiation
 
 FAMILIES = ("lgl", "cgl", "lgr-left", "lgr-right", "lg")
 
@@ -67,15 +68,6 @@ def collocation(family: str, points: int) -> Collocation:
     A = np.concatenate([np.pad(A, ((0, 0), (0, 1))), end[None]])
     B = np.concatenate([np.eye(points), own.w[None]])
     return Collocation(np.append(support, 1.0), own.x, 1, own.w, A, B, np.arange(points + 1), none)
-
-
-def differentiation(x: np.ndarray) -> np.ndarray:
-    """Matrix of the derivative at `x` of the polynomial through values there (eq. 13)."""
-    eye = np.eye(len(x))
-    gaps = x[:, None] - x[None, :] + eye
-    weights = 1 / np.prod(2 * gaps - eye, axis=1)
-    d = (weights[None, :] / weights[:, None] - eye) / gaps
-    return d - np.diag(d.sum(axis=1))
 
 
 @ft.cache

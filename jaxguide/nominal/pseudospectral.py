@@ -22,22 +22,25 @@ from jaxguide.nominal.transcription import (
     Scale,
     Transcription,
     bounds,
+    chosen,
     constraint_counts,
     node_times,
     parameters,
     with_integrals,
-    with_parameters,
 )
 from jaxguide.problem import (
     Problem,
     bounds_of,
     initial_values,
     is_free,
+    parameter_names,
     start_control,
     start_value,
+    with_parameters,
 )
+from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, is_traced
 
 
 class Pseudospectral(eqx.Module):
@@ -47,8 +50,8 @@ class Pseudospectral(eqx.Module):
 
     - `grid`: "lgl" (the review's choice; for one segment: on many, its two equations at each
       shared node cost accuracy), "cgl", "lgr-left", "lgr-right" (default) or "lg".
-    - `nodes`: collocation nodes a segment. `segments`: of equal length, unless `fractions`
-      (segments + 1,), from 0 to 1, places their ends.
+    - `nodes`: collocation nodes a segment. `segments`: how many, of equal length; or instead
+      `fractions`, the break points of the horizon from 0 to 1.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
     - `refinements`: how often `solve` may move or double the mesh until each segment's defect
       between the nodes, relative to the state's span, is below `mesh_tolerance`. Under a trace
@@ -80,8 +83,19 @@ class Pseudospectral(eqx.Module):
             raise ValueError(f"Pseudospectral: max_iterations is {self.max_iterations}.")
         if self.refinements < 0:
             raise ValueError(f"Pseudospectral: refinements is {self.refinements}; need at least 0.")
-        if not 0 < self.tolerance < 1:
-            raise ValueError(f"Pseudospectral: tolerance is {self.tolerance}; give one in (0, 1).")
+        for name in ("tolerance", "mesh_tolerance"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(
+                    f"Pseudospectral: {name} is {getattr(self, name)}; give one in (0, 1)."
+                )
+        if self.fractions is not None and not is_traced(self.fractions):
+            given = np.asarray(self.fractions, float)
+            ends = given.ndim == 1 and given.size > 1 and (given[0], given[-1]) == (0.0, 1.0)
+            if not ends or not np.all(np.diff(given) > 0):
+                raise ValueError(
+                    f"Pseudospectral: fractions is {self.fractions}; give break points that "
+                    "ascend from 0 to 1, such as (0, 0.3, 1)."
+                )
         collocation(self.grid, self.nodes)
 
     def check_fields(self, problem: Problem) -> None:
@@ -117,7 +131,15 @@ class Pseudospectral(eqx.Module):
             fractions = jnp.asarray(self.fractions, dtype)
         unit = unit_scale(whole)
         program = Transcription(whole, unit, fractions, self.grid, self.nodes)
-        w = straight_guess(program) if guess is None else from_extremal(program, guess)
+        if guess is None:
+            w = straight_guess(program)
+        elif isinstance(guess, Extremal):
+            w = from_extremal(program, problem, guess)
+        else:
+            raise ValueError(
+                f"guess is a {type(guess).__name__}; jg.Pseudospectral takes an Extremal (costates "
+                "are for jg.Shooting), or None."
+            )
         scale = designer_units(program, w)
         program = eqx.tree_at(lambda p: p.scale, program, scale)
         w = jax.tree_util.tree_map(jnp.divide, w, program.units)
@@ -170,20 +192,19 @@ def horizon_guess(problem: Problem) -> tuple[Array, Array]:
         return t0, jnp.asarray(start_value(tf), dtype)
     lo, hi = jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype)
     bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
-    free = jnp.clip(t0 + 1.0, lo, hi)
-    return t0, jnp.where(bounded, jnp.where(bounded, (lo + hi) / 2, 0.0), free)
+    return t0, jnp.where(bounded, start_value(tf), jnp.clip(t0 + 1.0, lo, hi))
 
 
 def straight_guess(program: Transcription) -> Primal:
     """States on a straight line to the nearest end that meets the endpoint constraints; controls
     in the middle of their bounds. In user units."""
-    problem, size = with_parameters(program.problem, None), program.sizes
+    problem, size = chosen(program.problem, None), program.sizes
     dtype = program.fractions.dtype
     lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
     x0 = jnp.clip(initial_values(program.problem, dtype), lo, hi)
     t0, tf = horizon_guess(program.problem)
     e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, size.end, dtype)
-    scale = state_scale(lo, hi, x0)
+    scale = typical(lo, hi, x0[None])
 
     def nearer(_: Any, xf: Array) -> Array:
         at = lambda y: problem.endpoint_constraints(x0, xf + y * scale, t0, tf)
@@ -200,16 +221,19 @@ def straight_guess(program: Transcription) -> Primal:
     rule = program.rule
     s = fractions_at(program, rule.support[1:])
     x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
-    p = [jnp.asarray(start_value(v), dtype) for v in parameters(program.problem)]
-    return Primal(
-        x0,
-        x,
-        jnp.broadcast_to(u, (size.segments, size.nodes, size.m)),
-        jnp.stack([t0, tf]),
-        jnp.stack(p) if p else jnp.zeros(0, dtype),
-        jnp.zeros((size.segments, size.nodes, size.path), dtype),
-        jnp.zeros(size.end, dtype),
-    )
+    u = jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
+    p = [start_value(v) for v in parameters(program.problem)]
+    return without_slacks(program, x0, x, u, (t0, tf), p)
+
+
+def without_slacks(
+    program: Transcription, x0: Array, x: Array, u: Array, times: Any, p: list
+) -> Primal:
+    """A guess whose slacks are yet to be filled in."""
+    size, dtype = program.sizes, program.fractions.dtype
+    p_ = jnp.stack([jnp.asarray(v, dtype) for v in p]) if p else jnp.zeros(0, dtype)
+    path = jnp.zeros((size.segments, size.nodes, size.path), dtype)
+    return Primal(x0, x, u, jnp.stack(times), p_, path, jnp.zeros(size.end, dtype))
 
 
 def fractions_at(program: Transcription, tau: np.ndarray) -> Float[Array, "segment k"]:
@@ -218,7 +242,7 @@ def fractions_at(program: Transcription, tau: np.ndarray) -> Float[Array, "segme
     return program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * local
 
 
-def from_extremal(program: Transcription, guess: Extremal) -> Primal:
+def from_extremal(program: Transcription, problem: Problem, guess: Extremal) -> Primal:
     """States and controls of `guess` at this mesh's times. In user units."""
     size, rule, dtype = program.sizes, program.rule, program.fractions.dtype
     t0, tf = guess.t[0], guess.t[-1]
@@ -228,24 +252,16 @@ def from_extremal(program: Transcription, guess: Extremal) -> Primal:
     )
     point = jax.vmap(jax.vmap(guess.point))
     x = fill(point(at(rule.support[1:])).x)
-    p = [jnp.asarray(start_value(v), dtype) for v in parameters(program.problem)]
-    return Primal(
-        fill(guess.x[0]),
-        x,
-        point(at(rule.nodes)).u,
-        jnp.stack([t0, tf]),
-        jnp.stack(p) if p else jnp.zeros(0, dtype),
-        jnp.zeros((size.segments, size.nodes, size.path), dtype),
-        jnp.zeros(size.end, dtype),
-    )
+    p = [getattr(guess.problem, k) for k in parameter_names(problem)]
+    p = [start_value(v) for v in p]
+    return without_slacks(program, fill(guess.x[0]), x, point(at(rule.nodes)).u, (t0, tf), p)
 
 
-def state_scale(lo: Array, hi: Array, *seen: Array) -> Array:
+def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
     """The larger finite bound; else the largest value seen; else 1."""
     bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
-    wide = jnp.maximum(jnp.abs(jnp.where(bounded, lo, 0.0)), jnp.abs(jnp.where(bounded, hi, 0.0)))
-    largest = jnp.max(jnp.abs(jnp.stack([jnp.broadcast_to(v, lo.shape) for v in seen])), axis=0)
-    scale = jnp.where(bounded & (wide > 0), wide, largest)
+    wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
+    scale = jnp.where(bounded & (wide > 0), wide, jnp.max(jnp.abs(seen), axis=0))
     return jnp.where(scale > 1e-8, scale, 1.0)
 
 
@@ -254,8 +270,8 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     problem, size, dtype = program.problem, program.sizes, program.fractions.dtype
     x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
     u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
-    x = state_scale(x_lo, x_hi, *w.x.reshape(-1, size.n), w.x0)
-    u = state_scale(u_lo, u_hi, jnp.zeros(size.m, dtype))
+    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
+    u = typical(u_lo, u_hi, jnp.zeros((1, size.m), dtype))
     t = jnp.maximum(w.times[1] - w.times[0], 1e-8)
     p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)
     scale = program.scale._replace(x=x, u=u, t=t, p=p)
@@ -269,7 +285,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     away = scaled._replace(x=scaled.x + 1.0, u=scaled.u + 1.0)
     steeper, _ = program.derivatives(away)
     weights = jnp.asarray(program.rule.w, dtype)[None, :, None]
-    largest = lambda a: jnp.nanmax(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0))
+    largest = lambda a: jnp.max(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0))
     cost = jnp.maximum(
         largest(nodes.jacobian[:, :, n] / weights), largest(steeper.jacobian[:, :, n] / weights)
     )
@@ -288,6 +304,7 @@ def to_extremal(
     """User units; costates by the covector mapping theorem (eqs 23-25)."""
     size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
     dtype, n = program.fractions.dtype, size.n
+    problem = with_parameters(problem, w.p * scale.p)
     support = program.support(w)
     whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
     t_support = node_times(program, w, rule.support)
@@ -295,7 +312,7 @@ def to_extremal(
     lam, before = costates(program, solution)
     to_user = scale.objective / scale.x
     # Controls and multipliers live at the nodes; the ends that are none, extrapolate them.
-    spread = extrapolation(program)
+    spread = interpolation_matrix(jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.support, dtype))
     at_nodes = node_times(program, w, rule.nodes).reshape(-1)
     x_nodes = support[:, rule.first : rule.first + size.nodes].reshape(-1, n) * scale.x[None]
     turned = unwrap_angles(
@@ -351,18 +368,6 @@ def to_extremal(
         problem=problem,
         certifier=certifier,
     )
-
-
-def extrapolation(program: Transcription) -> Float[Array, "support node"]:
-    """Values at the support points of the polynomial through the nodes."""
-    rule = program.rule
-    gaps = rule.nodes[:, None] - rule.nodes[None, :] + np.eye(len(rule.nodes))
-    weights = 1 / np.prod(2 * gaps - np.eye(len(rule.nodes)), axis=1)
-    dx = rule.support[:, None] - rule.nodes[None, :]
-    hit = dx == 0
-    terms = weights / np.where(hit, 1.0, dx)
-    terms = np.where(hit.any(axis=1, keepdims=True), hit, terms)
-    return jnp.asarray(terms / terms.sum(axis=1, keepdims=True), program.fractions.dtype)
 
 
 def costates(

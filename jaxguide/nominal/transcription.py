@@ -3,7 +3,6 @@
 Every function here is evaluated node by node; nothing assembles a matrix of the whole.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,7 +19,8 @@ from jaxguide.problem import (
     initial_values,
     initially_free,
     is_free,
-    start_value,
+    parameter_names,
+    with_parameters,
 )
 
 
@@ -153,7 +153,7 @@ class Transcription(eqx.Module):
         n, m, scale = self.problem.n, self.problem.m, self.scale
         x, u = q[:n] * scale.x, q[n : n + m] * scale.u
         ta, tb = q[n + m] * scale.t, q[n + m + 1] * scale.t
-        problem = with_parameters(self.problem, q[n + m + 2 :] * scale.p)
+        problem = chosen(self.problem, q[n + m + 2 :] * scale.p)
         t = (ta * (1 - tau) + tb * (1 + tau)) / 2  # eq. (5)
         rate = (tb - ta) / 2
         f = rate * problem.dynamics(t, x, u) / scale.x
@@ -164,7 +164,7 @@ class Transcription(eqx.Module):
         """(E, e) from (x0, times, p, xf), scaled."""
         n, scale = self.problem.n, self.scale
         x0, times, p, xf = b[:n], b[n : n + 2], b[n + 2 : -n], b[-n:]
-        problem = with_parameters(self.problem, p * scale.p)
+        problem = chosen(self.problem, p * scale.p)
         at = (x0 * scale.x, xf * scale.x, times[0] * scale.t, times[1] * scale.t)
         cost = problem.endpoint_cost(*at) / scale.objective
         return jnp.concatenate([cost[None], problem.endpoint_constraints(*at) / scale.end])
@@ -233,7 +233,7 @@ def constraint_counts(problem: Problem) -> tuple[int, int]:
     """Numbers of path and endpoint constraints."""
     dtype = jnp.result_type(float)
     t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
-    problem = with_parameters(problem, None)
+    problem = chosen(problem, None)
     path = jax.eval_shape(problem.path_constraints, t, x, u).shape[0]
     return path, jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
 
@@ -292,31 +292,17 @@ def with_integrals(problem: Problem) -> Problem:
     )
 
 
-BOUNDARY = ("initial_time", "final_time", "initial_state")
-
-
-def parameter_names(problem: Problem) -> tuple[str, ...]:
-    """Fields that hold a `jg.Free` the solver may choose."""
-    problem = getattr(problem, "inner", problem)
-    names = (f.name for f in dataclasses.fields(problem))
-    return tuple(k for k in names if k not in BOUNDARY and is_free(getattr(problem, k)))
-
-
 def parameters(problem: Problem) -> list[Free]:
-    problem = getattr(problem, "inner", problem)
-    return [getattr(problem, k) for k in parameter_names(problem)]
+    """The static parameters left to the solver."""
+    own = problem.inner if isinstance(problem, WithIntegrals) else problem
+    return [getattr(own, k) for k in parameter_names(own)]
 
 
-def with_parameters(problem: Problem, p: Any) -> Problem:
-    """`problem` with the numbers `p` (None: where a search starts) for its `jg.Free` fields."""
-    names = parameter_names(problem)
-    if not names:
-        return problem
-    if p is None:
-        p = [jnp.asarray(start_value(v), float) for v in parameters(problem)]
-    inner = lambda q: getattr(q, "inner", q)
-    where = lambda q: [getattr(inner(q), k) for k in names]
-    return eqx.tree_at(where, problem, [p[i] for i in range(len(names))], is_leaf=is_free)
+def chosen(problem: Problem, p: Any) -> Problem:
+    """`with_parameters`, of the problem inside a WithIntegrals too."""
+    if not isinstance(problem, WithIntegrals):
+        return with_parameters(problem, p)
+    return eqx.tree_at(lambda q: q.inner, problem, with_parameters(problem.inner, p))
 
 
 class Bounds(NamedTuple):

@@ -51,11 +51,8 @@ def grid(family: str, n: int) -> Grid:
     if family not in FAMILIES:
         raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}.")
     x, w = FAMILIES[family](n)
-    eye = np.eye(n)
-    # 2 is the inverse capacity of [-1, 1]; in this order of factors float64 holds past n = 512.
-    weights = 1 / np.prod((x[:, None] - x[None, :] + eye / 2) * 2, axis=1)
-    d = (weights[None, :] / weights[:, None] - eye) / (x[:, None] - x[None, :] + eye)
-    d -= np.diag(d.sum(axis=1))
+    weights = capacity_weights(x)
+    d = differentiation(x, weights)
 
     def rows(query):
         dx = query[:, None] - x[None, :]
@@ -74,3 +71,17 @@ def grid(family: str, n: int) -> Grid:
     for a in out:
         a.flags.writeable = False
     return out
+
+
+def capacity_weights(x: np.ndarray) -> np.ndarray:
+    """Barycentric weights: 2 is the inverse capacity of [-1, 1]; in this order of factors float64
+    holds past n = 512."""
+    return 1 / np.prod((x[:, None] - x[None, :] + np.eye(len(x)) / 2) * 2, axis=1)
+
+
+def differentiation(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """The differentiation matrix of any distinct nodes, in NumPy."""
+    weights = capacity_weights(x) if weights is None else weights
+    eye = np.eye(len(x))
+    d = (weights[None, :] / weights[:, None] - eye) / (x[:, None] - x[None, :] + eye)
+    return d - np.diag(d.sum(axis=1))
