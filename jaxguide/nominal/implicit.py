@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxguide.nominal import kkt
 from jaxguide.nominal.interior_point import Solution, barrier_gradient, boxed, distances
-from jaxguide.nominal.transcription import Dual, Primal, Residual, Transcription, bounds
+from jaxguide.nominal.transcription import Primal, Transcription, bounds
 
 _tree = jax.tree_util.tree_map
 
@@ -31,14 +31,11 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
         at = _tree(lambda w, g, lo: jnp.where(g, lo, w), w, given, box.lo)
         low, high = distances(box, at)
 
-        def lagrangian(w: Primal) -> Any:
-            f, c = here.objective_and_residual(w)
-            terms = _tree(lambda a, b: jnp.sum(a * b), y, Dual(*c))
-            return f + sum(jax.tree_util.tree_leaves(terms), jnp.zeros_like(f))
-
-        force = _tree(jnp.add, jax.grad(lagrangian)(at), barrier_gradient(box, low, high, mu))
+        nodes, ends = here.derivatives(at)
+        _, c = here.objective_and_residual(at, (nodes.value, ends.value))
+        force = kkt.gradient(here, nodes, ends, at, y)
+        force = _tree(jnp.add, force, barrier_gradient(box, low, high, mu))
         force = _tree(lambda f, g: jnp.where(g, 0.0, f), force, given)
-        _, c = here.objective_and_residual(at)
         fixed = _tree(lambda g, lo: jnp.where(g, lo, 0.0), given, box.lo)
         return kkt.Load(force, c), fixed, (low, high)
 
@@ -57,16 +54,16 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
     factor, _ = kkt.factorise(program, system, segments, zero, 1e2 * (1 + largest))
 
     # One flat vector: transposition wants a right-hand side that is linear as a whole.
-    right = kkt.Step(_tree(jnp.negative, load.force), Dual(*_tree(jnp.negative, load.residual)))
+    right = kkt.Step(_tree(jnp.negative, load.force), _tree(jnp.negative, load.residual))
     flat, unravel = ravel_pytree(right)
 
     def product(v: jax.Array) -> jax.Array:
         load = kkt.product(program, system, zero, unravel(v))
-        return ravel_pytree(kkt.Step(load.force, Dual(*load.residual)))[0]
+        return ravel_pytree(kkt.Step(load.force, load.residual))[0]
 
     def solve(_: Any, v: jax.Array) -> jax.Array:
         step = unravel(-v)
-        load = kkt.Load(step.primal, Residual(*step.dual))
+        load = kkt.Load(step.primal, step.dual)
         return ravel_pytree(kkt.solve(program, system, segments, factor, load))[0]
 
     step = unravel(jax.lax.custom_linear_solve(product, flat, solve, symmetric=True))

@@ -7,6 +7,7 @@ serves every kind of step, so that the factorisation is compiled once.
 **Source:** Waechter & Biegler, Math. Program. 106 (2006); equation numbers below are theirs.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,11 +17,8 @@ from jaxtyping import Array, Float, Int
 from jaxguide.nominal import kkt
 from jaxguide.nominal.transcription import (
     Bounds,
-    Dual,
-    Ends,
-    Nodes,
     Primal,
-    Residual,
+    Rows,
     Transcription,
 )
 
@@ -54,7 +52,7 @@ class Solution(NamedTuple):
     """Where the iterations ended."""
 
     w: Primal
-    y: Dual
+    y: Rows
     zl: Primal
     zu: Primal
     mu: Float[Array, ""]
@@ -72,7 +70,7 @@ class _Filter(NamedTuple):
 
 class _State(NamedTuple):
     w: Primal
-    y: Dual
+    y: Rows
     zl: Primal
     zu: Primal
     mu: Array
@@ -147,7 +145,7 @@ def _finite(tree: Any) -> Array:
     return jnp.isfinite(_total(_tree(jnp.abs, tree)))
 
 
-def _norm1(c: Residual) -> Array:
+def _norm1(c: Rows) -> Array:
     return _total(_tree(jnp.abs, c))
 
 
@@ -220,28 +218,27 @@ def _augment(filter: _Filter, theta: Array, phi: Array, add: Array) -> _Filter:
 
 
 def optimality_error(
-    program: Transcription, box: _Box, w: Primal, y: Dual, zl: Primal, zu: Primal, c: Residual,
-    mu: Array,
-) -> Array:  # fmt: skip
-    """E_mu of eq. (5): the worst scaled violation of the perturbed conditions."""
-
-    def lagrangian(w: Primal) -> Array:
-        f, c = program.objective_and_residual(w)
-        return f + _total(_tree(lambda a, b: a * b, y, Dual(*c)))
-
-    gradient = _tree(lambda g, a, b: g - a + b, jax.grad(lagrangian)(w), zl, zu)
-    gradient = _tree(lambda g, given: jnp.where(given, 0.0, g), gradient, box.given)
+    box: _Box, gradient: Primal, w: Primal, y: Rows, zl: Primal, zu: Primal, c: Rows
+) -> Callable[[Array], Array]:
+    """mu -> E_mu of eq. (5): the worst scaled violation of the perturbed conditions. `gradient`:
+    of the Lagrangian without its bounds."""
+    net = _tree(lambda g, a, b: g - a + b, gradient, zl, zu)
+    net = _tree(lambda g, given: jnp.where(given, 0.0, g), net, box.given)
     low, high = distances(box, w)
     z = _total(zl) + _total(zu)
     duals = _total(_tree(jnp.abs, y)) + z
     s_d = jnp.maximum(_S_MAX, duals / (_count(y) + 2 * _count(w))) / _S_MAX
     s_d = jnp.minimum(s_d, _S_D_MAX)
     s_c = jnp.maximum(_S_MAX, z / (2 * _count(w))) / _S_MAX
-    short = lambda a, z, on: jnp.where(on, a * z - mu, 0.0)
-    gap = jnp.maximum(
-        _largest(_tree(short, low, zl, box.below)), _largest(_tree(short, high, zu, box.above))
-    )
-    return jnp.maximum(jnp.maximum(_largest(gradient) / s_d, _largest(c)), gap / s_c)
+    smooth = jnp.maximum(_largest(net) / s_d, _largest(c))
+
+    def error(mu: Array) -> Array:
+        short = lambda a, z, on: jnp.where(on, a * z - mu, 0.0)
+        below = _largest(_tree(short, low, zl, box.below))
+        above = _largest(_tree(short, high, zu, box.above))
+        return jnp.maximum(smooth, jnp.maximum(below, above) / s_c)
+
+    return error
 
 
 def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Options) -> Solution:
@@ -256,7 +253,7 @@ def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Opt
     _, c = program.objective_and_residual(w)
     theta = _norm1(c)
     zero, nought = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    y = Dual(*_tree(jnp.zeros_like, c))
+    y = _tree(jnp.zeros_like, c)
     slots = jnp.full(_FILTER, -jnp.inf, dtype)
     state = _State(
         w, y, zl, zu, mu,
@@ -276,7 +273,8 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     nodes, ends = program.derivatives(s.w)
     f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
     low, high = distances(box, s.w)
-    error = lambda mu: optimality_error(program, box, s.w, s.y, s.zl, s.zu, c, mu)
+    lagrangian = kkt.gradient(program, nodes, ends, s.w, s.y)
+    error = optimality_error(box, lagrangian, s.w, s.y, s.zl, s.zu, c)
     error_now = error(jnp.zeros_like(s.mu))
     done = newton & (error_now <= options.tolerance)
 
@@ -296,7 +294,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     ones, zeros = _tree(jnp.ones_like, sigma), _tree(jnp.zeros_like, sigma)
     sigma = _where(estimate, zeros._replace(path=ones.path, end=ones.end), sigma)
     system = kkt.System(nodes, ends, hessians[0], hessians[1], sigma, box.given)
-    gradient = objective_gradient(program, nodes, ends, s.w)
+    gradient = kkt.gradient(program, nodes, ends, s.w, _tree(jnp.zeros_like, s.y))
     pull = barrier_gradient(box, low, high, mu)
     barrier = _tree(lambda a, b: a + b, gradient, pull)
     bare = _tree(lambda g, a, b: g - a + b, gradient, s.zl, s.zu)
@@ -332,7 +330,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
 
     def judge(
         alpha: Array, slope: Array, d: Primal, length: Array
-    ) -> tuple[Array, Array, Residual, Array]:
+    ) -> tuple[Array, Array, Rows, Array]:
         """Whether a move by `length` d is acceptable as a step of size `alpha`."""
         steep = jnp.where(slope < 0, -slope, 0.0)
         w = _move(s.w, length, d)
@@ -422,10 +420,3 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
         jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
         s.k + 1, status.astype(s.status.dtype), error_now,
     )  # fmt: skip
-
-
-def objective_gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal) -> Primal:
-    """Of the objective."""
-    on_support = jnp.zeros_like(program.support(w))
-    n = program.sizes.n
-    return kkt.transpose(program, w, nodes.jacobian[:, :, n], ends.jacobian[0], on_support)

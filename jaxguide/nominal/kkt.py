@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, lu_factor, lu_solve
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.nominal.transcription import Dual, Ends, Nodes, Primal, Residual, Transcription
+from jaxguide.nominal.transcription import Ends, Nodes, Primal, Rows, Transcription
 
 COMPLIANCE = 1e-8  # of path constraints: an equality is a spring of stiffness 1/this
 _SOFT = 1e-11
@@ -38,14 +38,14 @@ class Load(NamedTuple):
     """The right-hand side, negated: the gradient without its constraint terms, and residuals."""
 
     force: Primal
-    residual: Residual
+    residual: Rows
 
 
 class Step(NamedTuple):
     """Change of the unknowns, and the multipliers after it."""
 
     primal: Primal
-    dual: Dual
+    dual: Rows
 
 
 class Segments(NamedTuple):
@@ -360,7 +360,7 @@ def apply(
         jnp.where(system.given.path, 0.0, d_path),
         jnp.where(system.given.end, 0.0, d_end),
     )
-    return Step(primal, Dual(rows, path, nu_))
+    return Step(primal, Rows(rows, path, nu_))
 
 
 def product(program: Transcription, system: System, delta: Array, step: Step) -> Load:
@@ -370,13 +370,10 @@ def product(program: Transcription, system: System, delta: Array, step: Step) ->
     J, rule = system.nodes.jacobian, program.rule
     A, B = (jnp.asarray(a, delta.dtype) for a in (rule.A, rule.B))
     dq, db = program.inputs(dw), program.end_inputs(dw)
-    weights = program.node_weights(y).at[:, :, n].set(0.0)
-    on_q = jnp.einsum("skab,skb->ska", system.node_hessian, dq)
-    on_q = on_q + jnp.einsum("sko,skoa->ska", weights, J)
-    e_b = system.ends.jacobian[1:]
-    on_b = system.end_hessian @ db + e_b.T @ y.end
-    on_support = jnp.einsum("rp,srn->spn", A, y.defect)
-    force = transpose(program, dw, on_q, on_b, on_support)
+    on_q, on_b, on_support = forces(program, system.nodes, system.ends, y, 0.0)
+    on_q = on_q + jnp.einsum("skab,skb->ska", system.node_hessian, dq)
+    on_b = on_b + system.end_hessian @ db
+    force = gather(program, dw, on_q, on_b, on_support)
     springs = lambda f, s, d, g: jnp.where(g, 0.0, f + (s + delta) * d)
     own = jax.tree_util.tree_map(springs, force, system.sigma, dw, system.given)
     slack = lambda y, s, d, g: jnp.where(g, 0.0, -y + s * d)
@@ -384,21 +381,41 @@ def product(program: Transcription, system: System, delta: Array, step: Step) ->
         path=slack(y.path, system.sigma.path, dw.path, system.given.path),
         end=slack(y.end, system.sigma.end, dw.end, system.given.end),
     )
+    e_b = system.ends.jacobian[1:]
     defect = jnp.einsum("rp,spn->srn", A, program.support(dw))
     defect = defect - jnp.einsum("rk,skna,ska->srn", B, J[:, :, :n], dq)
     path = jnp.einsum("skha,ska->skh", J[:, :, n + 1 :], dq) - dw.path - COMPLIANCE * y.path
-    return Load(force, Residual(defect, path, e_b @ db - dw.end))
+    return Load(force, Rows(defect, path, e_b @ db - dw.end))
 
 
-def transpose(
+def forces(
+    program: Transcription, nodes: Nodes, ends: Ends, y: Rows, cost: float
+) -> tuple[Array, Array, Array]:
+    """Derivatives of `cost` f + y^T c by the nodes' inputs, the endpoint inputs and, of A X alone,
+    the support points."""
+    n = program.sizes.n
+    weights = program.node_weights(y).at[:, :, n].set(cost)
+    on_q = jnp.einsum("sko,skoa->ska", weights, nodes.jacobian)
+    on_b = cost * ends.jacobian[0] + y.end @ ends.jacobian[1:]
+    A = jnp.asarray(program.rule.A, y.defect.dtype)
+    return on_q, on_b, jnp.einsum("rp,srn->spn", A, y.defect)
+
+
+def gather(
     program: Transcription, like: Primal, on_q: Array, on_b: Array, on_support: Array
 ) -> Primal:
-    """Forces on nodes' inputs, endpoint inputs and support points, gathered on the unknowns."""
+    """`forces` on the unknowns themselves."""
 
     def spread(w: Primal) -> tuple[Array, Array, Array]:
         return program.inputs(w), program.end_inputs(w), program.support(w)
 
     return jax.linear_transpose(spread, like)((on_q, on_b, on_support))[0]
+
+
+def gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Rows) -> Primal:
+    """Of the Lagrangian f + y^T c, from Jacobians at hand."""
+    on_unknowns = gather(program, w, *forces(program, nodes, ends, y, 1.0))
+    return on_unknowns._replace(path=-y.path, end=-y.end)
 
 
 def solve(
@@ -413,6 +430,6 @@ def solve(
         return jax.tree_util.tree_map(lambda a, b: a + b, step, better)
 
     # From nothing, so that the elimination is compiled once.
-    blank = Step(load.force, Dual(*load.residual))
+    blank = Step(load.force, load.residual)
     blank = jax.tree_util.tree_map(jnp.zeros_like, blank)
     return jax.lax.fori_loop(0, 1 + _REFINEMENTS, refine, blank)

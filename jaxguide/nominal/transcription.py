@@ -36,16 +36,9 @@ class Primal(NamedTuple):
     end: Float[Array, " q"]  # slacks of the endpoint constraints
 
 
-class Dual(NamedTuple):
-    """Multipliers of `Residual`, of the scaled Lagrangian f + y^T c."""
-
-    defect: Float[Array, "segment row n"]
-    path: Float[Array, "segment node h"]
-    end: Float[Array, " q"]
-
-
-class Residual(NamedTuple):
-    """The equality constraints: all vanish."""
+class Rows(NamedTuple):
+    """One number for each equality constraint: its residual c, which vanishes, or its multiplier y
+    in the scaled Lagrangian f + y^T c."""
 
     defect: Float[Array, "segment row n"]
     path: Float[Array, "segment node h"]
@@ -181,14 +174,14 @@ class Transcription(eqx.Module):
         over = jax.vmap(jax.vmap(self.node), in_axes=(None, None, 0))
         return over(*self._taus, self.inputs(w)), self.end(self.end_inputs(w))
 
-    def objective_and_residual(self, w: Primal, values: Any = None) -> tuple[Array, Residual]:
+    def objective_and_residual(self, w: Primal, values: Any = None) -> tuple[Array, Rows]:
         """J of problem P and the constraints, scaled."""
         node, end = self.values(w) if values is None else values
         n, rule, dtype = self.problem.n, self.rule, self.fractions.dtype
         A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
         defect = jnp.einsum("rp,spn->srn", A, self.support(w))
         defect = defect - jnp.einsum("rk,skn->srn", B, node[:, :, :n])
-        residual = Residual(defect, node[:, :, n + 1 :] - w.path, end[1:] - w.end)
+        residual = Rows(defect, node[:, :, n + 1 :] - w.path, end[1:] - w.end)
         return jnp.sum(node[:, :, n]) + end[0], residual
 
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
@@ -200,14 +193,14 @@ class Transcription(eqx.Module):
         end_jacobian, end_value = jax.jacfwd(both(self.end), has_aux=True)(self.end_inputs(w))
         return Nodes(value, jacobian), Ends(end_value, end_jacobian)
 
-    def node_weights(self, y: Dual) -> Float[Array, "segment node out"]:
+    def node_weights(self, y: Rows) -> Float[Array, "segment node out"]:
         """What multiplies each of `Nodes.value` in the Lagrangian."""
         B = jnp.asarray(self.rule.B, y.defect.dtype)
         f = -jnp.einsum("rk,srn->skn", B, y.defect)
         return jnp.concatenate([f, jnp.ones_like(f[:, :, :1]), y.path], axis=2)
 
     def hessians(
-        self, w: Primal, y: Dual
+        self, w: Primal, y: Rows
     ) -> tuple[Float[Array, "segment node in in"], Float[Array, "end end"]]:
         """Second derivatives of the Lagrangian, node by node, and of its endpoint part."""
         weights = self.node_weights(y)
