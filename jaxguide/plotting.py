@@ -17,6 +17,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from jaxguide.spectral.grids import evaluation
+
 Units = Mapping[str, str] | None
 
 # Okabe & Ito's colours, dark ones first: distinct to colour-blind readers, and in grey by dashes.
@@ -124,11 +126,16 @@ def _names(problem: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def plot_extremal(extremal: Any, units: Units = None) -> Figure:
     """Control, states and costates of an Extremal (2002 paper, figure 2; the costates beside)."""
     states, controls = _names(extremal.problem)
-    t = np.asarray(extremal.t)
+    breaks, reference, pieces = _pieces(extremal)
+    # Between the nodes too, which lie far apart on a mesh that has moved elsewhere.
+    tau = np.linspace(-1.0, 1.0, 24)
+    t = ((breaks[1:] + breaks[:-1])[:, None] + np.diff(breaks)[:, None] * tau).reshape(-1) / 2
+    fine = np.concatenate(evaluation(reference, tau) @ pieces)
+    n = len(states)
     panels = (
-        ("control", np.asarray(extremal.u), controls, ""),
-        ("state", np.asarray(extremal.x), states, ""),
-        ("costate", np.asarray(extremal.costate), states, r"\lambda"),
+        ("control", fine[:, n:-n], controls, ""),
+        ("state", fine[:, :n], states, ""),
+        ("costate", fine[:, -n:], states, r"\lambda"),
     )
     figure, axes = _grid(3, 1, 2.1, sharex=True)
     for axis, (what, values, names, prefix) in zip(axes[:, 0], panels, strict=True):
@@ -414,22 +421,27 @@ def _ellipse(axis: Axes, centre: np.ndarray, covariance: np.ndarray, **options: 
 def at(extremal: Any, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """States and controls of an Extremal at `t`, interpolated on the host in the Extremal's own
     piecewise polynomials: a figure should not cost a compilation."""
-    nodes, x, u = (np.asarray(a) for a in (extremal.t, extremal.x, extremal.u))
-    degree = len(np.asarray(extremal.reference_nodes)) - 1
-    values = np.concatenate([x, u], axis=1)
-    out = np.empty((len(t), values.shape[1]))
-    breaks = nodes[::degree]
+    breaks, reference, pieces = _pieces(extremal)
+    n, m = extremal.problem.n, extremal.problem.m
+    out = np.empty((len(t), n + m))
     segment = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
     for s in np.unique(segment):
-        own = slice(s * degree, (s + 1) * degree + 1)
-        # A difference table in the shifted variable would do as well; barycentric is shorter.
-        local = nodes[own]
-        span = local[-1] - local[0]
-        gaps = (local[:, None] - local[None, :]) / span + np.eye(degree + 1)
-        weights = 1 / np.prod(4 * gaps, axis=1)
-        here = np.flatnonzero(segment == s)
-        away = (np.clip(t[here], nodes[0], nodes[-1])[:, None] - local[None, :]) / span
-        hit = np.abs(away) < 1e-14
-        terms = np.where(hit.any(axis=1)[:, None], hit, weights / np.where(hit, 1.0, away))
-        out[here] = (terms / terms.sum(axis=1, keepdims=True)) @ values[own]
-    return out[:, : x.shape[1]], out[:, x.shape[1] :]
+        here, (a, b) = segment == s, breaks[s : s + 2]
+        tau = np.clip((2 * t[here] - a - b) / (b - a), -1.0, 1.0)
+        out[here] = evaluation(reference, tau) @ pieces[s, :, : n + m]
+    return out[:, :n], out[:, n:]
+
+
+def _pieces(extremal: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Breaks, reference nodes, and (x, u, costate) at them, segment by segment, each segment with
+    its own end: control and costate may jump."""
+    reference = np.asarray(extremal.reference_nodes)
+    values = np.concatenate([np.asarray(a) for a in (extremal.x, extremal.u, extremal.costate)], 1)
+    degree = len(reference) - 1
+    breaks = np.asarray(extremal.t)[::degree]
+    index = np.arange(len(breaks) - 1)[:, None] * degree + np.arange(degree + 1)[None, :]
+    pieces, n = values[index], extremal.problem.n
+    if extremal.u_before is not None:
+        pieces[:, -1, n:-n] = extremal.u_before
+        pieces[:, -1, -n:] = extremal.costate_before
+    return breaks, reference, pieces

@@ -63,7 +63,7 @@ def extremal():
     x = np.stack([1 + t**2 / 20, 0.1 * t, 1 - t**3 / 90], axis=1)
     return types.SimpleNamespace(
         t=t, x=x, u=t[:, None] ** 4 / 30, costate=-x, reference_nodes=tau,
-        final_time=breaks[-1], problem=EarthMars(),
+        final_time=breaks[-1], problem=EarthMars(), u_before=None,
     )  # fmt: skip
 
 
@@ -177,3 +177,11 @@ def test_host_collocation_of_the_double_integrator():
     for square in (False, True):
         K = U @ collocation.horizon(t, system, square)[0]
         np.testing.assert_allclose(K, [[-1.5, -2.0]], atol=1e-12)
+
+
+def test_a_jump_of_the_control_stays_at_its_break():
+    e = extremal()
+    e.u = np.where(e.t[:, None] >= 1.5, 1.0, 0.0)
+    e.u_before, e.costate_before = np.array([[0.0], [0.0], [1.0]]), -e.x[P - 1 :: P - 1]
+    _, u = plotting.at(e, np.array([0.5, 1.2, 1.49, 1.5, 2.0]))
+    np.testing.assert_allclose(u[:, 0], [0, 0, 0, 1, 1], atol=1e-14)

@@ -54,20 +54,13 @@ def grid(family: str, n: int) -> Grid:
     weights = capacity_weights(x)
     d = differentiation(x, weights)
 
-    def rows(query):
-        dx = query[:, None] - x[None, :]
-        hit = dx == 0
-        terms = weights[None, :] / np.where(hit, 1.0, dx)
-        terms = np.where(hit.any(axis=1, keepdims=True), hit, terms)
-        return terms / terms.sum(axis=1, keepdims=True)
-
     points, gauss = nodes_lg(n)
     k = np.arange(n)
     legendre = (k[:, None] + 0.5) * np.polynomial.legendre.legvander(points, n - 1).T * gauss
     p = np.polynomial.legendre.legvander(x, n) - (-1.0) ** np.arange(n + 1)
     lower = np.concatenate([np.zeros((n, 1)), p[:, : n - 1]], axis=1)
-    b = (p[:, 1:] - lower) / (2 * k + 1) @ legendre @ rows(points)
-    out = Grid(x, w, d, b, rows(np.array([-1.0, 1.0])))
+    b = (p[:, 1:] - lower) / (2 * k + 1) @ legendre @ evaluation(x, points, weights)
+    out = Grid(x, w, d, b, evaluation(x, np.array([-1.0, 1.0]), weights))
     for a in out:
         a.flags.writeable = False
     return out
@@ -85,3 +78,13 @@ def differentiation(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
     eye = np.eye(len(x))
     d = (weights[None, :] / weights[:, None] - eye) / (x[:, None] - x[None, :] + eye)
     return d - np.diag(d.sum(axis=1))
+
+
+def evaluation(x: np.ndarray, query: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Matrix of the interpolant through any distinct nodes `x`, at `query`, in NumPy."""
+    weights = capacity_weights(x) if weights is None else weights
+    dx = query[:, None] - x[None, :]
+    hit = dx == 0
+    terms = weights[None, :] / np.where(hit, 1.0, dx)
+    terms = np.where(hit.any(axis=1, keepdims=True), hit, terms)
+    return terms / terms.sum(axis=1, keepdims=True)
