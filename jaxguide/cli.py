@@ -159,7 +159,10 @@ def solve(name: str, *, out: Path | None = None, common: Common = Common()) -> O
     out
         Folder for the figure.
     """
+    from jaxguide import problems as library
+
     problem, extremal = _solved(name)
+    known = library.reference(name)
     with waiting(RichProgress("certificate")):
         certificate = extremal.certificate
         table, rows = str(certificate), certificate.rows()
@@ -171,6 +174,7 @@ def solve(name: str, *, out: Path | None = None, common: Common = Common()) -> O
     data = {
         "problem": name,
         "objective": extremal.objective,
+        "known": known._asdict(),
         "final_time": extremal.final_time,
         "state_names": problem.state_names,
         "control_names": problem.control_names,
@@ -184,6 +188,7 @@ def solve(name: str, *, out: Path | None = None, common: Common = Common()) -> O
     }
     head = (
         f"objective   {float(extremal.objective):.12g}\n"
+        f"known       {known.value:.12g} +- {known.uncertainty:.0e}  ({known.source})\n"
         f"final time  {float(extremal.final_time):.12g}"
     )
     ok = all(row["passed"] for row in rows)

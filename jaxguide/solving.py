@@ -23,7 +23,8 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
     - `problem`: the Problem; its parameters may be traced, so this may be `vmap`ped and
       differentiated (implicitly, forward and reverse).
     - `method`: `jg.Shooting` or `jg.Pseudospectral`. Default: shooting, the more accurate, unless
-      the Problem has bounds, path constraints or what else shooting cannot do.
+      the Problem has bounds, path constraints or what else shooting cannot do. Where its bounds
+      are traced that cannot be seen: name the method, or look for `bounds_violated`.
     - `guess`: None, an Extremal of a similar problem, or initial costates (n,).
     - `throw`: raise if it fails. Under a trace nothing is raised; look at `.result`.
 

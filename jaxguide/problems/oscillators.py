@@ -78,9 +78,7 @@ class Fuller(Problem):
     initial_state = (0.0, 1.0)
     final_time = 3.5
     control_bounds = (-1.0, 1.0)
-    reference = Reference(
-        0.2683939, 1e-7, "independent, two meshes", "CTDirect.jl fuller", loose=True
-    )
+    reference = Reference(0.2683939, 1e-7, "independent, two meshes", "CTDirect.jl fuller")
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         return jnp.stack([x[1], self.limit * u[0]])
@@ -99,7 +97,7 @@ class Singular5(Problem):
     control_names = ("u",)
     initial_state = (0.0, -1.0, -(5.0**0.5))
     control_bounds = (0.0, 10.0)
-    reference = Reference(0.119248, 1e-6, "independent, two meshes", "PSOPT singular5", loose=True)
+    reference = Reference(0.119248, 1e-6, "independent, two meshes", "PSOPT singular5")
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         return jnp.stack([x[1], -x[2] * u[0] + 16 * t - 8, u[0]])

@@ -16,7 +16,7 @@ class CatalystMixing(Problem):
     initial_state = (1.0, 0.0)
     control_bounds = (0.0, 1.0)
     reference = Reference(
-        -0.0480556858608761, 1e-14, "independent, arcs as phases", "PSOPT catmix; COPS", loose=True
+        -0.0480556858608761, 1e-14, "independent, arcs as phases", "PSOPT catmix; COPS"
     )
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
@@ -37,7 +37,7 @@ class Jackson(Problem):
     control_bounds = (0.0, 1.0)
     reference = Reference(
         -0.19181435632518, 1e-14, "independent, arcs as phases", "CTDirect.jl jackson",
-        trap="published 0.192011 and unstructured collocation (0.1918165) overshoot", loose=True,
+        trap="published 0.192011 and unstructured collocation (0.1918165) overshoot",
     )  # fmt: skip
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
@@ -64,7 +64,7 @@ class Tumour(Problem):
     control_bounds = (0.0, 75.0)
     reference = Reference(
         7571.67, 3e-4, "independent, two meshes", "Ledzewicz & Schaettler; Betts; pycollo",
-        trap="three published values disagree in digit 7", loose=True,
+        trap="three published values disagree in digit 7",
     )  # fmt: skip
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:

@@ -11,4 +11,3 @@ class Reference(NamedTuple):
     basis: str
     source: str
     trap: str = ""
-    loose: bool = False  # singular arcs or chattering: 1e-4 is what a fixed mesh can do

@@ -75,9 +75,7 @@ class ShuttleReentryHeat(ShuttleReentry):
     """As above with the leading edge heated by at most 70 BTU/ft^2/s."""
 
     path_bounds = (-math.inf, 70.0)
-    reference = Reference(
-        -0.534515, 2e-6, "independent, two meshes", "Betts example 6.2; dymos", loose=True
-    )
+    reference = Reference(-0.534515, 2e-6, "independent, two meshes", "Betts example 6.2; dymos")
 
     def path_constraints(self, t: Any, x: Any, u: Any) -> Any:
         degrees = u[0] / _DEGREE

@@ -44,7 +44,7 @@ class Goddard(Problem):
     control_bounds = (0.0, 1.0)
     reference = Reference(
         -1.01283693, 2e-8, "independent, arcs as phases", "COPS; OptimalControlProblems.jl rocket",
-        trap="unstructured collocation overshoots to 1.0128452", loose=True,
+        trap="unstructured collocation overshoots to 1.0128452",
     )  # fmt: skip
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
@@ -65,7 +65,7 @@ class GoddardSpeedLimit(Goddard):
 
     state_bounds = ((1.0, 0.0, 0.6), (2.0, 0.1, 1.0))
     reference = Reference(
-        -1.0125827647, 1e-10, "independent, arcs as phases", "CTDirect.jl goddard", loose=True
+        -1.0125827647, 1e-10, "independent, arcs as phases", "CTDirect.jl goddard"
     )
 
 
