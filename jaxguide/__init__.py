@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from jaxguide.neighboring.gains import gain_schedule as gain_schedule
     from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
     from jaxguide.neighboring.linearization import linearize as linearize
+    from jaxguide.nominal.phased import PhaseEnds as PhaseEnds
+    from jaxguide.nominal.phased import Phased as Phased
     from jaxguide.nominal.pseudospectral import Pseudospectral as Pseudospectral
     from jaxguide.nominal.shooting import Shooting as Shooting
     from jaxguide.problem import Free as Free
@@ -64,6 +66,8 @@ _HOME = {
     "NeighboringOptimal": "laws.neighboring",
     "Normal": "montecarlo.dispersions",
     "OpenLoop": "laws.law",
+    "PhaseEnds": "nominal.phased",
+    "Phased": "nominal.phased",
     "Problem": "problem",
     "Pseudospectral": "nominal.pseudospectral",
     "RESULTS": "types",

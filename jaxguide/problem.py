@@ -113,6 +113,14 @@ class Problem(eqx.Module):
         """Optional closed form of H_u = 0 with H minimised, shape (m,); None: solved by Newton."""
         return None
 
+    def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
+        """Where a `Free` static parameter is held, for the solver to choose."""
+        return tuple(
+            (f.name,)
+            for f in dataclasses.fields(self)
+            if f.name not in _BOUNDARY and is_free(getattr(self, f.name))
+        )
+
     @property
     def n(self) -> int:
         """Number of states."""
@@ -130,25 +138,30 @@ class Problem(eqx.Module):
 
 
 _BOUNDARY = ("initial_time", "final_time", "initial_state")
-
-
-def parameter_names(problem: Problem) -> tuple[str, ...]:
-    """Fields that hold a `Free` static parameter, for the solver to choose."""
-    return tuple(
-        f.name
-        for f in dataclasses.fields(problem)
-        if f.name not in _BOUNDARY and is_free(getattr(problem, f.name))
-    )
+Path = tuple[str | int, ...]  # attributes and indices that lead from a Problem to a leaf
 
 
 def with_parameters(problem: Problem, p: Any) -> Problem:
-    """`problem` with the numbers `p` (None: where a search starts) for its `Free` fields."""
-    names = parameter_names(problem)
-    if not names:
+    """`problem` with the numbers `p` (None: where a search starts) for its `Free` parameters."""
+    paths = problem.parameter_paths()
+    if not paths:
         return problem  # itself, and not a copy
+    entries = parameters(problem)
     if p is None:
-        p = [as_float(start_value(getattr(problem, k))) for k in names]
-    return replace_parameters(problem, names, p)
+        p = [as_float(start_value(entry)) for entry in entries]
+    where = lambda q: [_follow(q, path) for path in paths]
+    return eqx.tree_at(where, problem, [p[i] for i in range(len(paths))], is_leaf=is_free)
+
+
+def parameters(problem: Problem, like: Problem | None = None) -> list[Any]:
+    """The entries of `problem` at its (or `like`'s) parameter paths."""
+    return [_follow(problem, path) for path in (problem if like is None else like).parameter_paths()]
+
+
+def _follow(tree: Any, path: Path) -> Any:
+    for key in path:
+        tree = getattr(tree, key) if isinstance(key, str) else tree[key]
+    return tree
 
 
 def replace_parameters(problem: Problem, names: tuple[str, ...], values: Any) -> Problem:

@@ -10,7 +10,8 @@ from jaxguide.certificate import certifier
 from jaxguide.nominal.pseudospectral import Pseudospectral
 from jaxguide.nominal.refinement import refined
 from jaxguide.nominal.shooting import Shooting
-from jaxguide.problem import Problem, parameter_names, validate, with_array_leaves
+from jaxguide.nominal.wrappers import closed, endless, opened
+from jaxguide.problem import Problem, is_free, validate, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
@@ -38,15 +39,29 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
         method.check_fields(problem)
     validate(problem)
     method.check(problem)
+    direct = isinstance(method, Pseudospectral)
+    without_end = direct and is_endless(problem)
     problem = with_array_leaves(problem)
+    if without_end:
+        problem = endless(problem, method.time_scale)
+        guess = closed(guess) if isinstance(guess, Extremal) and guess.stretch is not None else guess
     if is_traced((problem, guess)):
-        return method(problem, guess, certifier(method.accuracy))
+        extremal = method(problem, guess, certifier(method.accuracy))
+        return opened(extremal) if without_end else extremal
     extremal = _run(method, problem, guess)
-    if isinstance(method, Pseudospectral) and method.refinements:
+    if direct and method.refinements:
         extremal = refined(_run, method, problem, extremal)
+    if without_end:
+        extremal = opened(extremal)
     if throw:
         raise_if_failed(extremal)
     return extremal
+
+
+def is_endless(problem: Problem) -> bool:
+    """Whether its final time is infinite, as far as can be seen."""
+    tf = problem.final_time
+    return not is_free(tf) and not is_traced(tf) and bool(np.any(np.isinf(np.asarray(tf))))
 
 
 def _is_unconstrained(problem: Problem) -> bool:
@@ -62,7 +77,8 @@ def _is_unconstrained(problem: Problem) -> bool:
         and infinite(problem.control_bounds)
         and own.path_constraints is Problem.path_constraints
         and own.integrands is Problem.integrands
-        and not parameter_names(problem)
+        and not problem.parameter_paths()
+        and not is_endless(problem)
         and bool(np.all(np.asarray(problem.endpoint_bounds[0]) == problem.endpoint_bounds[1]))
     )
 

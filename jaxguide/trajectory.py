@@ -29,19 +29,22 @@ class Multipliers(eqx.Module):
     path: Float[Array, "node p"]
     state: Float[Array, "node n"]
     control: Float[Array, "node m"]
+    integral: Float[Array, " r"]
 
 
 class Trajectory(eqx.Module):
     """State and control at nodes: segments that share their ends, each a polynomial.
 
     Segment s holds nodes s (p - 1) ... (s + 1)(p - 1), placed like `reference_nodes` (p,) of
-    [-1, 1], both ends included.
+    [-1, 1], both ends included. Polynomials are in time; on an infinite horizon, whose last node
+    is at t = inf, in s with t = t0 + stretch (1 + s)/(1 - s).
     """
 
     t: Float[Array, " node"]
     x: Float[Array, "node n"]
     u: Float[Array, "node m"]
     reference_nodes: Float[Array, " p"]
+    stretch: Float[Array, ""] | None = eqx.field(default=None, kw_only=True)
 
     @property
     def breaks(self) -> Float[Array, " edge"]:
@@ -70,15 +73,21 @@ class Trajectory(eqx.Module):
 
     def _at(self, pick: Callable, t: Any) -> Array:
         t = jnp.clip(jnp.asarray(t, self.t.dtype), self.t[0], self.t[-1])
-        breaks = self.breaks
+        t, breaks = self.clock(t), self.clock(self.breaks)
         last = breaks.shape[0] - 2
         s = jnp.clip(jnp.searchsorted(breaks, t, side="right") - 1, 0, last)
-        return interpolate(self.reference_nodes, pick(s), self._local(t, s))
+        a, b = breaks[s], breaks[s + 1]
+        tau = (2 * t - a - b) / jnp.where(b > a, b - a, 1.0)
+        return interpolate(self.reference_nodes, pick(s), tau)
 
-    def _local(self, t: Array, s: Array) -> Array:
-        """tau of `t` in segment `s`."""
-        a, b = self.breaks[s], self.breaks[s + 1]
-        return (2 * t - a - b) / jnp.where(b > a, b - a, 1.0)
+    def clock(self, t: Array) -> Array:
+        """What the polynomials are in, at the times `t`."""
+        if self.stretch is None:
+            return t
+        since = t - self.t[0]
+        ends = jnp.isinf(since)
+        since = jnp.where(ends, 1.0, since)
+        return jnp.where(ends, 1.0, (since - self.stretch) / (since + self.stretch))
 
 
 class Extremal(Trajectory):

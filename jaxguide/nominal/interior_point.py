@@ -244,7 +244,7 @@ def optimality_error(
 def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Options) -> Solution:
     """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
     box = boxed(bounds)
-    dtype = program.fractions.dtype
+    dtype = program.dtype
     w = inside(box, start, options.push)
     mu = jnp.asarray(options.mu, dtype)
     low, high = distances(box, w)

@@ -180,8 +180,10 @@ def _sweep(
     """Minimises over the controls, last segment first."""
     size = program.sizes
     n, nu, np_, dtype = size.n, size.nodes * size.m, size.parameters, H.dtype
-    n_theta = 3 * n + 2 + np_
-    own, xf, lam = slice(0, n), slice(n + 2 + np_, 2 * n + 2 + np_), slice(n_theta - n, n_theta)
+    nt = size.times
+    n_theta = 3 * n + nt + np_
+    own, xf = slice(0, n), slice(n + nt + np_, 2 * n + nt + np_)
+    lam = slice(n_theta - n, n_theta)
     eye = jnp.eye(n, dtype=dtype)
     # V at the end: lambda_f^T (x - xf) + rho |x - xf|^2 / 2.
     P = jnp.zeros((n_theta, n_theta), dtype)
@@ -193,8 +195,8 @@ def _sweep(
     rest = jnp.concatenate([jnp.arange(n), jnp.arange(n + nu, n + nu + 2 + np_)])
     L = jnp.zeros((size.segments, n + 2 + np_, n_theta), dtype)
     L = L.at[:, :n, :n].set(eye)
-    L = L.at[:, n : n + 2, n : n + 2].set(program.clocks)
-    L = L.at[:, n + 2 :, n + 2 : n + 2 + np_].set(jnp.eye(np_, dtype=dtype))
+    L = L.at[:, n : n + 2, n : n + nt].set(program.clocks)
+    L = L.at[:, n + 2 :, n + nt : n + nt + np_].set(jnp.eye(np_, dtype=dtype))
     controls = slice(n, n + nu)
 
     def back(carry: tuple, item: tuple) -> tuple[tuple, _Stage]:
@@ -234,7 +236,7 @@ def _globals(
     """The matrix of (x0, times, p, xf, lambda_f, nu), and which of them are held."""
     size = program.sizes
     n, q, dtype = size.n, size.end, P.dtype
-    moving = n + 2 + size.parameters  # x0, times, p
+    moving = n + size.times + size.parameters  # x0, times, p
     nb = moving + n  # and xf
     join = lambda w: jnp.concatenate([w.x0, w.times, w.p])
     given = join(system.given)
@@ -302,7 +304,7 @@ def apply(
     p, (k, d, p_after) = jax.lax.scan(back, zero, items, reverse=True)
 
     # The global unknowns.
-    moving = n + 2 + np_
+    moving = n + size.times + np_
     own_force = jnp.concatenate([force.x0, force.times, force.p])
     p = p.at[:moving].add(own_force)
     pulled = jnp.where(system.given.end, 0.0, _flexibility(system) * force.end)
@@ -312,7 +314,7 @@ def apply(
     solution = invert(rhs)
     solution = (solution + invert(rhs - factor.K @ solution)) / factor.equilibrium
     theta, nu_ = solution[: len(p)], solution[len(p) :]
-    parameters = theta[n + 2 : moving]
+    parameters = theta[n + size.times : moving]
 
     # Forward.
     def forward(theta: Array, item: tuple) -> tuple[Array, tuple]:
@@ -322,7 +324,7 @@ def apply(
         if d.shape[0]:
             eta = cho_solve((s.small, True), s.D @ theta + d)
             u = u - s.KE @ eta
-        v = jnp.concatenate([theta[:n], u, c @ theta[n : n + 2], parameters])
+        v = jnp.concatenate([theta[:n], u, c @ theta[n : n + size.times], parameters])
         after = theta.at[:n].set(X @ v + x_end)
         return after, (v, eta, s.P[:n] @ after + p_after[:n])
 
@@ -349,13 +351,13 @@ def apply(
     h_dq = jnp.einsum("skha,ska->skh", h_q, dq)
     path = stiffness * h_dq + pushed
     d_path = h_dq + residual.path - COMPLIANCE * path
-    b = theta[: 2 * n + 2 + np_]
+    b = theta[: moving + n]
     d_end = system.ends.jacobian[1:] @ b + residual.end
     primal = Primal(
         theta[:n],
         dx,
         du,
-        theta[n : n + 2],
+        theta[n : n + size.times],
         parameters,
         jnp.where(system.given.path, 0.0, d_path),
         jnp.where(system.given.end, 0.0, d_end),

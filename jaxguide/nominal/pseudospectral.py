@@ -22,18 +22,17 @@ from jaxguide.nominal.transcription import (
     Scale,
     Transcription,
     bounds,
-    chosen,
     constraint_counts,
     node_times,
-    parameters,
-    with_integrals,
 )
+from jaxguide.nominal.wrappers import Endless, count, relaxed, with_integrals
 from jaxguide.problem import (
     Problem,
     bounds_of,
     initial_values,
+    initially_free,
     is_free,
-    parameter_names,
+    parameters,
     start_control,
     start_value,
     with_parameters,
@@ -51,7 +50,14 @@ class Pseudospectral(eqx.Module):
     - `grid`: "lgl" (the review's choice; for one segment: on many, its two equations at each
       shared node cost accuracy), "cgl", "lgr-left", "lgr-right" (default) or "lg".
     - `nodes`: collocation nodes a segment. `segments`: how many, of equal length; or instead
-      `fractions`, the break points of the horizon from 0 to 1.
+      `fractions`, the break points of the horizon from 0 to 1. `knots`: which of the inner ones
+      (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
+      others keep their places between them. For switches, kinks and junctions.
+    - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
+      (n,): delta^N of problem B^N. Zero: not at all.
+    - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
+      Radau nodes that leave out s = 1, where the state vanishes unless the Problem has endpoint
+      constraints of its own.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
     - `refinements`: how often `solve` may move or double the mesh until each segment's defect
       between the nodes, relative to the state's span, is below `mesh_tolerance`. Under a trace
@@ -66,6 +72,9 @@ class Pseudospectral(eqx.Module):
     nodes: int = eqx.field(static=True, default=6)
     segments: int = eqx.field(static=True, default=12)
     fractions: Any = None
+    knots: tuple[int, ...] = eqx.field(static=True, default=())
+    relaxation: Any = eqx.field(static=True, default=0.0)
+    time_scale: float = eqx.field(static=True, default=1.0)
     tolerance: float = eqx.field(static=True, default=1e-9)
     max_iterations: int = eqx.field(static=True, default=500)
     refinements: int = eqx.field(static=True, default=8)
@@ -96,19 +105,23 @@ class Pseudospectral(eqx.Module):
                     f"Pseudospectral: fractions is {self.fractions}; give break points that "
                     "ascend from 0 to 1, such as (0, 0.3, 1)."
                 )
+        breaks = self.segments if self.fractions is None else np.shape(self.fractions)[0] - 1
+        if any(not 0 < k < breaks for k in self.knots) or len(set(self.knots)) < len(self.knots):
+            raise ValueError(
+                f"Pseudospectral: knots is {self.knots}; name each inner break once, from 1 to "
+                f"{breaks - 1}."
+            )
+        if not np.all(np.asarray(self.relaxation) >= 0):
+            raise ValueError(f"Pseudospectral: relaxation is {self.relaxation}; need at least 0.")
+        if not self.time_scale > 0:
+            raise ValueError(f"Pseudospectral: time_scale is {self.time_scale}; give one above 0.")
         collocation(self.grid, self.nodes)
 
     def check_fields(self, problem: Problem) -> None:
         """Nothing that a Problem may hold is beyond it. Host only."""
 
     def check(self, problem: Problem) -> None:
-        """Refuses an infinite horizon, which needs its own map. Host only."""
-        tf = problem.final_time
-        if not is_free(tf) and np.any(np.isinf(np.asarray(tf))):
-            raise ValueError(
-                f"{type(problem).__name__}.final_time is infinite; give a finite one (some ten "
-                "time constants)."
-            )
+        """Nothing that a Problem may ask is beyond it. Host only."""
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
@@ -116,25 +129,35 @@ class Pseudospectral(eqx.Module):
         # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
         mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
-        whole = with_integrals(problem)
+        whole = self.whole(problem)
         solution = _solved(whole, program, start, options)
         program = eqx.tree_at(lambda p: p.problem, program, whole)
         return to_extremal(problem, program, bounds(program), solution, certifier)
 
+    def whole(self, problem: Problem) -> Problem:
+        """`problem` with what the transcription needs besides: integrals, relaxed dynamics."""
+        whole = with_integrals(problem)
+        if not np.any(np.asarray(self.relaxation)):
+            return whole
+        delta = jnp.broadcast_to(jnp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
+        return relaxed(whole, jnp.pad(delta, (0, whole.n - problem.n)))
+
     def prepared(self, problem: Problem, guess: Any) -> tuple[Transcription, Primal]:
         """The transcription in designer units, and where the search starts."""
         dtype = jnp.result_type(float)
-        whole = with_integrals(problem)
+        whole = self.whole(problem)
         if self.fractions is None:
             fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
         else:
             fractions = jnp.asarray(self.fractions, dtype)
-        unit = unit_scale(whole)
-        program = Transcription(whole, unit, fractions, self.grid, self.nodes)
+        unit = unit_scale(whole, len(self.knots))
+        # At the end of an infinite horizon time stands still: no node may lie there.
+        family = "lgr-left" if isinstance(problem, Endless) else self.grid
+        program = Transcription(whole, unit, edges(fractions, self.knots), family, self.nodes)
         if guess is None:
-            w = straight_guess(program)
+            w = straight_guess(program, fractions, self.knots)
         elif isinstance(guess, Extremal):
-            w = from_extremal(program, problem, guess)
+            w = from_extremal(program, fractions, self.knots, problem, guess)
         else:
             raise ValueError(
                 f"guess is a {type(guess).__name__}; jg.Pseudospectral takes an Extremal (costates "
@@ -145,6 +168,19 @@ class Pseudospectral(eqx.Module):
         w = jax.tree_util.tree_map(jnp.divide, w, program.units)
         node, end = program.values(w)
         return program, w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+
+
+def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
+    """Break points as combinations of (t0, tf, knots): each between the two nearest of them."""
+    last = fractions.shape[0] - 1
+    main = np.array([0, *sorted(knots), last])
+    column = np.array([0, *range(2, 2 + len(knots)), 1])
+    j = np.arange(last + 1)
+    left = np.clip(np.searchsorted(main, j, side="right") - 1, 0, len(main) - 2)
+    a, b = fractions[main[left]], fractions[main[left + 1]]
+    share = (fractions - a) / (b - a)
+    out = jnp.zeros((last + 1, 2 + len(knots)), fractions.dtype)
+    return out.at[j, column[left]].add(1 - share).at[j, column[left + 1]].add(share)
 
 
 @jax.custom_batching.sequential_vmap
@@ -173,8 +209,9 @@ def _(primals: Any, tangents: Any) -> Any:
     return solution, sensitivity(program, solution, tangents[0])
 
 
-def unit_scale(problem: Problem) -> Scale:
+def unit_scale(problem: Problem, knots: int) -> Scale:
     path, end = constraint_counts(problem)
+    end += knots + 1 if knots else 0
     one = jnp.ones((), jnp.result_type(float))
     many = lambda k: jnp.ones(k, one.dtype)
     return Scale(
@@ -195,66 +232,91 @@ def horizon_guess(problem: Problem) -> tuple[Array, Array]:
     return t0, jnp.where(bounded, start_value(tf), jnp.clip(t0 + 1.0, lo, hi))
 
 
-def straight_guess(program: Transcription) -> Primal:
-    """States on a straight line to the nearest end that meets the endpoint constraints; controls
+def straight_guess(
+    program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...]
+) -> Primal:
+    """States on a straight line to the nearest ends that meet the endpoint constraints; controls
     in the middle of their bounds. In user units."""
-    problem, size = chosen(program.problem, None), program.sizes
-    dtype = program.fractions.dtype
-    lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
+    problem, size = with_parameters(program.problem, None), program.sizes
+    dtype, n = program.dtype, size.n
+    lo, hi = bounds_of(program.problem.state_bounds, n, dtype)
     x0 = jnp.clip(initial_values(program.problem, dtype), lo, hi)
     t0, tf = horizon_guess(program.problem)
-    e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, size.end, dtype)
-    scale = typical(lo, hi, x0[None])
+    q = size.end - len(program.order)
+    e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, q, dtype)
+    scale = jnp.tile(typical(lo, hi, x0[None]), 2)
+    # Free components of the initial state move with the final ones.
+    free = jnp.concatenate([jnp.asarray(initially_free(program.problem)), jnp.ones(n, bool)])
+    scale = jnp.where(free, scale, 0.0)
+    low, high = jnp.tile(lo, 2), jnp.tile(hi, 2)
 
-    def nearer(_: Any, xf: Array) -> Array:
-        at = lambda y: problem.endpoint_constraints(x0, xf + y * scale, t0, tf)
-        e, J = at(jnp.zeros_like(xf)), jax.jacfwd(at)(jnp.zeros_like(xf))
+    def nearer(_: Any, ends: Array) -> Array:
+        def at(y: Array) -> Array:
+            moved = ends + y * scale
+            return problem.endpoint_constraints(moved[:n], moved[n:], t0, tf)
+
+        e, J = at(jnp.zeros_like(ends)), jax.jacfwd(at)(jnp.zeros_like(ends))
         miss = e - jnp.clip(e, e_lo, e_hi)
         gram = J @ J.T
-        ridge = 1e-8 * (jnp.trace(gram) + 1e-30) * jnp.eye(size.end, dtype=dtype)
+        ridge = 1e-8 * (jnp.trace(gram) + 1e-30) * jnp.eye(q, dtype=dtype)
         step = J.T @ small_solve(gram + ridge, miss)
         step = jnp.where(jnp.isfinite(step), step, 0.0)
-        return jnp.clip(xf - scale * step, lo, hi)
+        return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
 
-    xf = jax.lax.fori_loop(0, 8, nearer, x0) if size.end else x0
+    ends = jnp.tile(x0, 2)
+    ends = jax.lax.fori_loop(0, 8, nearer, ends) if q else ends
+    x0, xf = ends[:n], ends[n:]
     u = start_control(program.problem, dtype)
-    rule = program.rule
-    s = fractions_at(program, rule.support[1:])
+    s = fractions_at(fractions, program.rule.support[1:])
     x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
     u = jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
     p = [start_value(v) for v in parameters(program.problem)]
-    return without_slacks(program, x0, x, u, (t0, tf), p)
+    times = placed(t0, tf, fractions, knots)
+    return without_slacks(program, x0, x, u, times, p)
+
+
+def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Float[Array, " k"]:
+    """t0, tf and the knots, at their fractions of the horizon."""
+    inner = t0 + (tf - t0) * fractions[np.array(sorted(knots), int)]
+    return jnp.concatenate([jnp.stack([t0, tf]), inner])
 
 
 def without_slacks(
-    program: Transcription, x0: Array, x: Array, u: Array, times: Any, p: list
+    program: Transcription, x0: Array, x: Array, u: Array, times: Array, p: list
 ) -> Primal:
     """A guess whose slacks are yet to be filled in."""
-    size, dtype = program.sizes, program.fractions.dtype
+    size, dtype = program.sizes, program.dtype
     p_ = jnp.stack([jnp.asarray(v, dtype) for v in p]) if p else jnp.zeros(0, dtype)
     path = jnp.zeros((size.segments, size.nodes, size.path), dtype)
-    return Primal(x0, x, u, jnp.stack(times), p_, path, jnp.zeros(size.end, dtype))
+    return Primal(x0, x, u, times, p_, path, jnp.zeros(size.end, dtype))
 
 
-def fractions_at(program: Transcription, tau: np.ndarray) -> Float[Array, "segment k"]:
+def fractions_at(fractions: Float[Array, " edge"], tau: np.ndarray) -> Float[Array, "segment k"]:
     """Where in the horizon the points `tau` of every segment are."""
-    local = jnp.asarray((tau[None] + 1) / 2, program.fractions.dtype)
-    return program.fractions[:-1, None] + jnp.diff(program.fractions)[:, None] * local
+    local = jnp.asarray((tau[None] + 1) / 2, fractions.dtype)
+    return fractions[:-1, None] + jnp.diff(fractions)[:, None] * local
 
 
-def from_extremal(program: Transcription, problem: Problem, guess: Extremal) -> Primal:
+def from_extremal(
+    program: Transcription,
+    fractions: Float[Array, " edge"],
+    knots: tuple[int, ...],
+    problem: Problem,
+    guess: Extremal,
+) -> Primal:
     """States and controls of `guess` at this mesh's times. In user units."""
-    size, rule, dtype = program.sizes, program.rule, program.fractions.dtype
+    size, rule, dtype = program.sizes, program.rule, program.dtype
     t0, tf = guess.t[0], guess.t[-1]
-    at = lambda tau: t0 + (tf - t0) * fractions_at(program, tau)
-    fill = lambda y: jnp.concatenate(
-        [y, jnp.zeros((*y.shape[:-1], size.n - y.shape[-1]), dtype)], axis=-1
+    at = lambda tau: t0 + (tf - t0) * fractions_at(fractions, tau)
+    fill = lambda y, k: jnp.concatenate(
+        [y, jnp.zeros((*y.shape[:-1], k - y.shape[-1]), dtype)], axis=-1
     )
     point = jax.vmap(jax.vmap(guess.point))
-    x = fill(point(at(rule.support[1:])).x)
-    p = [getattr(guess.problem, k) for k in parameter_names(problem)]
-    p = [start_value(v) for v in p]
-    return without_slacks(program, fill(guess.x[0]), x, point(at(rule.nodes)).u, (t0, tf), p)
+    x = fill(point(at(rule.support[1:])).x, size.n)
+    u = fill(point(at(rule.nodes)).u, size.m)
+    p = [start_value(v) for v in parameters(guess.problem, like=problem)]
+    times = placed(t0, tf, fractions, knots)
+    return without_slacks(program, fill(guess.x[0], size.n), x, u, times, p)
 
 
 def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
@@ -267,7 +329,7 @@ def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n
 
 def designer_units(program: Transcription, w: Primal) -> Scale:
     """Scales from bounds and the guess; constraints and objective by their gradients there."""
-    problem, size, dtype = program.problem, program.sizes, program.fractions.dtype
+    problem, size, dtype = program.problem, program.sizes, program.dtype
     x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
     u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
     x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
@@ -291,7 +353,9 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     )
     end_rows = jnp.max(jnp.abs(ends.jacobian), axis=1)
     objective = usable(jnp.maximum(cost, end_rows[0]))
-    return scale._replace(path=usable(rows[n + 1 :]), end=usable(end_rows[1:]), objective=objective)
+    end = usable(end_rows[1:])
+    end = end.at[size.end - len(program.order) :].set(1.0)  # of the knots: in units of time
+    return scale._replace(path=usable(rows[n + 1 :]), end=end, objective=objective)
 
 
 def to_extremal(
@@ -303,7 +367,7 @@ def to_extremal(
 ) -> Extremal:
     """User units; costates by the covector mapping theorem (eqs 23-25)."""
     size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
-    dtype, n = program.fractions.dtype, size.n
+    dtype, n = program.dtype, size.n
     problem = with_parameters(problem, w.p * scale.p)
     support = program.support(w)
     whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
@@ -315,15 +379,18 @@ def to_extremal(
     spread = interpolation_matrix(jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.support, dtype))
     at_nodes = node_times(program, w, rule.nodes).reshape(-1)
     x_nodes = support[:, rule.first : rule.first + size.nodes].reshape(-1, n) * scale.x[None]
+    own_u = w.u.reshape(-1, size.m)
     turned = unwrap_angles(
-        problem, at_nodes, x_nodes[:, : problem.n], w.u.reshape(-1, size.m) * scale.u[None]
+        problem, at_nodes, x_nodes[:, : problem.n], (own_u * scale.u[None])[:, : problem.m]
     )
+    turned = own_u.at[:, : problem.m].set(turned / scale.u[None, : problem.m]).reshape(w.u.shape)
     u_lo, u_hi = box.lo.u[0, 0], box.hi.u[0, 0]
     unbounded = jnp.isinf(u_lo) & jnp.isinf(u_hi)
-    turned = jnp.where(unbounded[None, None], (turned / scale.u[None]).reshape(w.u.shape), w.u)
+    turned = jnp.where(unbounded[None, None], turned, w.u)
     u = jnp.einsum("pk,skm->spm", spread, turned)
     u = jnp.clip(u, u_lo[None, None], u_hi[None, None])
-    rate = jnp.diff(program.fractions) * (w.times[1] - w.times[0]) / 2  # dt/dtau, scaled
+    spans = program.clocks @ w.times
+    rate = (spans[:, 1] - spans[:, 0]) / 2  # dt/dtau, scaled
     clock = rate[:, None, None] * scale.t
     weight = jnp.asarray(rule.w, dtype)[None, :, None] * clock
     # A break belongs to the segment that has it as a node: the one before it, for "lgr-right".
@@ -345,23 +412,26 @@ def to_extremal(
     result = RESULTS.where(status == interior_point.INFEASIBLE, RESULTS.infeasible, result)
     finite = jnp.all(jnp.isfinite(support)) & jnp.all(jnp.isfinite(w.u))
     result = RESULTS.where(finite, result, RESULTS.optimiser_stopped)
-    k, q = problem.n, size.end - (n - problem.n)
+    k, m, r = problem.n, problem.m, n - problem.n
+    q = size.end - len(program.order) - r
+    nu = solution.y.end * scale.objective / scale.end
     f, _ = program.objective_and_residual(w)
     return Extremal(
         t=t,
         x=whole(support)[:, :k] * scale.x[None, :k],
-        u=whole(u) * scale.u[None],
+        u=(whole(u) * scale.u[None])[:, :m],
         reference_nodes=jnp.asarray(rule.support, dtype),
-        u_before=u[:, -1] * scale.u[None],
+        u_before=(u[:, -1] * scale.u[None])[:, :m],
         costate=whole(lam)[:, :k] * to_user[None, :k],
         costate_before=before[:, :k] * to_user[None, :k],
         final_time=w.times[1] * scale.t,
         objective=f * scale.objective,
         multipliers=Multipliers(
-            (solution.y.end * scale.objective / scale.end)[:q],
+            nu[:q],
             over_nodes(solution.y.path) / scale.path[None],
             state[:, :k],
-            over_nodes(solution.zu.u - solution.zl.u) / scale.u[None],
+            (over_nodes(solution.zu.u - solution.zl.u) / scale.u[None])[:, :m],
+            nu[q : q + r],
         ),
         result=result,
         residual=solution.violation,
@@ -381,7 +451,7 @@ def costates(
     the left null vector of D, fixed per state by both closures.
     """
     size, rule, w, y = program.sizes, program.rule, solution.w, solution.y
-    dtype, n, C = program.fractions.dtype, size.n, size.nodes
+    dtype, n, C = program.dtype, size.n, size.nodes
     A, weights = jnp.asarray(rule.A, dtype), jnp.asarray(rule.w, dtype)
     f_part = program.node_weights(y)
     nodal = f_part[:, :, :n] / weights[None, :, None]

@@ -278,7 +278,9 @@ class Shooting(eqx.Module):
             costate=costate,
             final_time=tf,
             objective=objective(problem, z, arcs[:, -1]),
-            multipliers=Multipliers(z.nu, zeros(size), zeros(n), zeros(problem.m)),
+            multipliers=Multipliers(
+                z.nu, zeros(size), zeros(n), zeros(problem.m), jnp.zeros(0, t.dtype)
+            ),
             result=_judge(problem, t, x, u, costate, worst),
             residual=worst,
             problem=problem,

@@ -13,15 +13,17 @@ from jaxtyping import Array, Float
 
 from jaxguide.nominal.mesh import Collocation, collocation
 from jaxguide.problem import (
-    Free,
     Problem,
     bounds_of,
     initial_values,
     initially_free,
     is_free,
-    parameter_names,
+    parameters,
     with_parameters,
 )
+
+
+_APART = 1e-6  # the least distance of free knots, of the horizon
 
 
 class Primal(NamedTuple):
@@ -30,7 +32,7 @@ class Primal(NamedTuple):
     x0: Float[Array, " n"]
     x: Float[Array, "segment after n"]
     u: Float[Array, "segment node m"]
-    times: Float[Array, " clock"]  # t0, tf
+    times: Float[Array, " clock"]  # t0, tf, free knots
     p: Float[Array, " parameter"]  # static parameters
     path: Float[Array, "segment node h"]  # slacks: what the path constraints should equal
     end: Float[Array, " q"]  # slacks of the endpoint constraints
@@ -81,14 +83,16 @@ class Sizes(NamedTuple):
     segments: int
     nodes: int
     after: int  # support points of a segment that follow its first
+    times: int
 
 
 class Transcription(eqx.Module):
-    """A Problem on `fractions` (S + 1) of its horizon, `points` nodes of `family` a segment."""
+    """A Problem on S segments, `points` nodes of `family` each; their breaks are the combinations
+    `edges` of the times t0, tf and free knots."""
 
     problem: Problem
     scale: Scale
-    fractions: Float[Array, " edge"]
+    edges: Float[Array, "edge clock"]
     family: str = eqx.field(static=True)
     points: int = eqx.field(static=True)
 
@@ -100,22 +104,34 @@ class Transcription(eqx.Module):
     def sizes(self) -> Sizes:
         problem = self.problem
         path, end = constraint_counts(problem)
+        times = self.edges.shape[1]
         return Sizes(
             problem.n,
             problem.m,
             self.scale.p.shape[0],
             path,
-            end,
-            self.fractions.shape[0] - 1,
+            end + (times - 1 if times > 2 else 0),
+            self.edges.shape[0] - 1,
             self.points,
             len(self.rule.support) - 1,
+            times,
         )
 
     @property
-    def clocks(self) -> Float[Array, "segment two two"]:
-        """(t_a, t_b) of every segment from (t0, tf)."""
-        row = lambda s: jnp.stack([1 - s, s], axis=-1)
-        return jnp.stack([row(self.fractions[:-1]), row(self.fractions[1:])], axis=1)
+    def clocks(self) -> Float[Array, "segment two clock"]:
+        """(t_a, t_b) of every segment from the times."""
+        return jnp.stack([self.edges[:-1], self.edges[1:]], axis=1)
+
+    @property
+    def dtype(self) -> Any:
+        return self.edges.dtype
+
+    @property
+    def order(self) -> Float[np.ndarray, "row clock"]:
+        """Differences of successive times, which free knots must keep above zero."""
+        count = self.edges.shape[1]
+        sequence = np.eye(count)[[0, *range(2, count), 1]]
+        return np.diff(sequence, axis=0) if count > 2 else np.zeros((0, count))
 
     @property
     def units(self) -> Primal:
@@ -146,7 +162,7 @@ class Transcription(eqx.Module):
         n, m, scale = self.problem.n, self.problem.m, self.scale
         x, u = q[:n] * scale.x, q[n : n + m] * scale.u
         ta, tb = q[n + m] * scale.t, q[n + m + 1] * scale.t
-        problem = chosen(self.problem, q[n + m + 2 :] * scale.p)
+        problem = with_parameters(self.problem, q[n + m + 2 :] * scale.p)
         t = (ta * (1 - tau) + tb * (1 + tau)) / 2  # eq. (5)
         rate = (tb - ta) / 2
         f = rate * problem.dynamics(t, x, u) / scale.x
@@ -156,18 +172,20 @@ class Transcription(eqx.Module):
     def end(self, b: Float[Array, " in"]) -> Float[Array, " out"]:
         """(E, e) from (x0, times, p, xf), scaled."""
         n, scale = self.problem.n, self.scale
-        x0, times, p, xf = b[:n], b[n : n + 2], b[n + 2 : -n], b[-n:]
-        problem = chosen(self.problem, p * scale.p)
+        clock = self.edges.shape[1]
+        x0, times, p, xf = b[:n], b[n : n + clock], b[n + clock : -n], b[-n:]
+        problem = with_parameters(self.problem, p * scale.p)
         at = (x0 * scale.x, xf * scale.x, times[0] * scale.t, times[1] * scale.t)
         cost = problem.endpoint_cost(*at) / scale.objective
-        return jnp.concatenate([cost[None], problem.endpoint_constraints(*at) / scale.end])
+        e = problem.endpoint_constraints(*at) / scale.end[: scale.end.shape[0] - len(self.order)]
+        return jnp.concatenate([cost[None], e, self.order @ times])
 
     def end_inputs(self, w: Primal) -> Float[Array, " in"]:
         return jnp.concatenate([w.x0, w.times, w.p, w.x[-1, -1]])
 
     @property
     def _taus(self) -> tuple[Array, Array]:
-        rule, dtype = self.rule, self.fractions.dtype
+        rule, dtype = self.rule, self.dtype
         return jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.w, dtype)
 
     def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
@@ -177,7 +195,7 @@ class Transcription(eqx.Module):
     def objective_and_residual(self, w: Primal, values: Any = None) -> tuple[Array, Rows]:
         """J of problem P and the constraints, scaled."""
         node, end = self.values(w) if values is None else values
-        n, rule, dtype = self.problem.n, self.rule, self.fractions.dtype
+        n, rule, dtype = self.problem.n, self.rule, self.dtype
         A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
         defect = jnp.einsum("rp,spn->srn", A, self.support(w))
         defect = defect - jnp.einsum("rk,skn->srn", B, node[:, :, :n])
@@ -226,76 +244,9 @@ def constraint_counts(problem: Problem) -> tuple[int, int]:
     """Numbers of path and endpoint constraints."""
     dtype = jnp.result_type(float)
     t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
-    problem = chosen(problem, None)
+    problem = with_parameters(problem, None)
     path = jax.eval_shape(problem.path_constraints, t, x, u).shape[0]
     return path, jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
-
-
-class WithIntegrals(Problem):
-    """`inner` with each of its integrals as a state that starts at zero and ends within bounds."""
-
-    inner: Problem
-
-    def dynamics(self, t: Any, x: Any, u: Any) -> Any:
-        x = x[: self.inner.n]
-        return jnp.concatenate([self.inner.dynamics(t, x, u), self.inner.integrands(t, x, u)])
-
-    def running_cost(self, t: Any, x: Any, u: Any) -> Any:
-        return self.inner.running_cost(t, x[: self.inner.n], u)
-
-    def path_constraints(self, t: Any, x: Any, u: Any) -> Any:
-        return self.inner.path_constraints(t, x[: self.inner.n], u)
-
-    def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
-        return self.inner.endpoint_cost(x0[: self.inner.n], xf[: self.inner.n], t0, tf)
-
-    def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
-        n = self.inner.n
-        own = self.inner.endpoint_constraints(x0[:n], xf[:n], t0, tf)
-        return jnp.concatenate([own, xf[n:]])
-
-
-def with_integrals(problem: Problem) -> Problem:
-    """`problem`, or a WithIntegrals of it where it has integral constraints."""
-    dtype = jnp.result_type(float)
-    t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
-    count = jax.eval_shape(with_parameters(problem, None).integrands, t, x, u).shape[0]
-    if not count:
-        return problem
-    _, q = constraint_counts(problem)
-    join = lambda a, b: tuple(jnp.concatenate([u, v]) for u, v in zip(a, b, strict=True))
-    states = bounds_of(problem.state_bounds, problem.n, dtype)
-    ends = bounds_of(problem.endpoint_bounds, q, dtype)
-    integrals = bounds_of(problem.integral_bounds, count, dtype)
-    start = problem.initial_state
-    if not isinstance(start, (tuple, list)):
-        free = [Free() if start is None else start] * problem.n
-        start = free if start is None or is_free(start) else [start[i] for i in range(problem.n)]
-    return WithIntegrals(
-        inner=problem,
-        state_names=problem.state_names + tuple(f"integral {i}" for i in range(count)),
-        control_names=problem.control_names,
-        initial_time=problem.initial_time,
-        final_time=problem.final_time,
-        initial_state=(*start, *(jnp.zeros((), dtype),) * count),
-        state_bounds=join(states, bounds_of((-jnp.inf, jnp.inf), count, dtype)),
-        control_bounds=problem.control_bounds,
-        endpoint_bounds=join(ends, integrals),
-        path_bounds=problem.path_bounds,
-    )
-
-
-def parameters(problem: Problem) -> list[Free]:
-    """The static parameters left to the solver."""
-    own = problem.inner if isinstance(problem, WithIntegrals) else problem
-    return [getattr(own, k) for k in parameter_names(own)]
-
-
-def chosen(problem: Problem, p: Any) -> Problem:
-    """`with_parameters`, of the problem inside a WithIntegrals too."""
-    if not isinstance(problem, WithIntegrals):
-        return with_parameters(problem, p)
-    return eqx.tree_at(lambda q: q.inner, problem, with_parameters(problem.inner, p))
 
 
 class Bounds(NamedTuple):
@@ -308,7 +259,7 @@ class Bounds(NamedTuple):
 def bounds(program: Transcription) -> Bounds:
     """Bounds, scaled. Entries of `x0` and `times` that are given have both equal."""
     problem, scale, size = program.problem, program.scale, program.sizes
-    dtype = program.fractions.dtype
+    dtype = program.dtype
     over = lambda b, *lead: jnp.broadcast_to(b, (*lead, *b.shape))
     number = lambda v: jnp.asarray(v, dtype)
 
@@ -331,10 +282,12 @@ def bounds(program: Transcription) -> Bounds:
             tighter = jnp.maximum if i == 0 else jnp.minimum
             x0[i] = jnp.where(free, tighter(own, states[i]), start)
     times = [scalar(problem.initial_time), scalar(problem.final_time)]
+    times += [(number(-jnp.inf), number(jnp.inf))] * (size.times - 2)
     p = [scalar(v) for v in parameters(problem)]
     controls = bounds_of(problem.control_bounds, size.m, dtype)
     path = bounds_of(problem.path_bounds, size.path, dtype)
-    end = bounds_of(problem.endpoint_bounds, size.end, dtype)
+    end = bounds_of(problem.endpoint_bounds, size.end - len(program.order), dtype)
+    apart = (jnp.full(len(program.order), _APART, dtype), jnp.full(len(program.order), jnp.inf, dtype))
 
     def side(i: int) -> Primal:
         return Primal(
@@ -344,7 +297,7 @@ def bounds(program: Transcription) -> Bounds:
             jnp.stack([t[i] for t in times]) / scale.t,
             (jnp.stack([v[i] for v in p]) if p else jnp.zeros(0, dtype)) / scale.p,
             over(path[i] / scale.path, size.segments, size.nodes),
-            end[i] / scale.end,
+            jnp.concatenate([end[i] / scale.end[: len(end[i])], apart[i]]),
         )
 
     return Bounds(side(0), side(1))
@@ -352,6 +305,6 @@ def bounds(program: Transcription) -> Bounds:
 
 def node_times(program: Transcription, w: Primal, at: np.ndarray) -> Float[Array, "segment k"]:
     """User times of the points `at` (tau) of every segment."""
-    tau = jnp.asarray(at, program.fractions.dtype)
+    tau = jnp.asarray(at, program.dtype)
     ends = program.clocks @ w.times * program.scale.t
     return (ends[:, :1] * (1 - tau)[None] + ends[:, 1:] * (1 + tau)[None]) / 2

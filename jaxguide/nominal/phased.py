@@ -1,0 +1,200 @@
+"""`jg.Phased`: problems one after another, linked, as one Problem on a common clock."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.nominal.wrappers import count, endpoint_count, initial_entries
+from jaxguide.problem import Free, Problem, bounds_of, is_free, start_value, with_parameters
+from jaxguide.trajectory import Extremal, Multipliers
+
+
+class PhaseEnds(NamedTuple):
+    """State and time at both ends of one phase, as `links` sees them."""
+
+    x0: Float[Array, " n"]
+    xf: Float[Array, " n"]
+    t0: Float[Array, ""]
+    tf: Float[Array, ""]
+
+
+class Phased(Problem):
+    """Phases that follow each other in time, each with dynamics, bounds, costs and constraints of
+    its own: staging, a rocket's arcs, anything with a jump of the state.
+
+    All phases run side by side on tau in [0, 1], t = t0 + tau (tf - t0) in each, so this is a
+    Problem like any other: review, eq. (2) and section 4 on knots.
+
+    **Arguments:** `phases`: Problems; each starts when the one before ends, at its `final_time` (a
+    number or `jg.Free`), and only the first one's `initial_time` counts. States of later phases
+    are free at their start unless their `initial_state` says otherwise. `links(ends)`: what must
+    vanish, (r,), from one `PhaseEnds` a phase; default: the state is continuous.
+
+    **Raises:** `ValueError` if phases that should be continuous have other states, or a phase has
+    no end.
+    """
+
+    phases: tuple[Problem, ...]
+    links: Callable[[tuple[PhaseEnds, ...]], Any] | None = eqx.field(static=True)
+
+    def __init__(self, phases: Any, links: Any = None, **derived: Any):
+        # `derived` holds what dataclasses.replace passes on: computed from the phases anew.
+        del derived
+        self.phases = phases = tuple(phases)
+        self.links = links
+        if len(phases) < 2:
+            raise ValueError(f"Phased: {len(phases)} phases; give at least two.")
+        for a, b in zip(phases[:-1], phases[1:], strict=True):
+            if links is None and a.state_names != b.state_names:
+                raise ValueError(
+                    f"Phased: {type(a).__name__} has states {a.state_names} and "
+                    f"{type(b).__name__} has {b.state_names}; say in `links` how they join."
+                )
+        named = lambda of: tuple(f"{i + 1}:{k}" for i, p in enumerate(phases) for k in of(p))
+        self.state_names = named(lambda p: p.state_names)
+        self.control_names = named(lambda p: p.control_names)
+        self.initial_time, self.final_time = 0.0, 1.0
+        self.initial_state = _starts(phases)
+        dtype = jnp.result_type(float)
+        sizes = lambda name: [count(p, name) for p in phases]
+        join = lambda name, k: _join(
+            [bounds_of(getattr(p, name), n, dtype) for p, n in zip(phases, k, strict=True)]
+        )
+        self.state_bounds = join("state_bounds", [p.n for p in phases])
+        self.control_bounds = join("control_bounds", [p.m for p in phases])
+        self.path_bounds = join("path_bounds", sizes("path_constraints"))
+        self.integral_bounds = join("integral_bounds", sizes("integrands"))
+        own = join("endpoint_bounds", [endpoint_count(p) for p in phases])
+        zero = jnp.zeros(self._links(_blank_ends(phases)).shape[0], dtype)
+        last = jnp.full(len(phases), jnp.inf, dtype)
+        durations = (jnp.zeros_like(last), last)
+        self.endpoint_bounds = _join([own, (zero, zero), durations])
+
+    def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
+        paths: list[tuple[str | int, ...]] = []
+        for i, phase in enumerate(self.phases):
+            names = ("initial_time", "final_time") if i == 0 else ("final_time",)
+            paths += [("phases", i, k) for k in names if is_free(getattr(phase, k))]
+            paths += [("phases", i, *path) for path in phase.parameter_paths()]
+        return tuple(paths)
+
+    def horizons(self) -> list[tuple[Any, Any]]:
+        """(t0, tf) of each phase."""
+        times = [self.phases[0].initial_time, *(p.final_time for p in self.phases)]
+        return list(zip(times[:-1], times[1:], strict=True))
+
+    def split_state(self, x: Array) -> list[Array]:
+        return jnp.split(x, np.cumsum([p.n for p in self.phases])[:-1], axis=-1)
+
+    def split_control(self, u: Array) -> list[Array]:
+        return jnp.split(u, np.cumsum([p.m for p in self.phases])[:-1], axis=-1)
+
+    def _each(self, tau: Any, x: Any, u: Any) -> list[tuple]:
+        """(phase, its duration, its own t, x, u)."""
+        parts = zip(
+            self.phases, self.horizons(), self.split_state(x), self.split_control(u), strict=True
+        )
+        return [(p, b - a, a + tau * (b - a), x, u) for p, (a, b), x, u in parts]
+
+    def dynamics(self, t: Any, x: Any, u: Any) -> Any:
+        return jnp.concatenate([span * p.dynamics(*at) for p, span, *at in self._each(t, x, u)])
+
+    def running_cost(self, t: Any, x: Any, u: Any) -> Any:
+        return sum(span * p.running_cost(*at) for p, span, *at in self._each(t, x, u))
+
+    def path_constraints(self, t: Any, x: Any, u: Any) -> Any:
+        return jnp.concatenate([p.path_constraints(*at) for p, _, *at in self._each(t, x, u)])
+
+    def integrands(self, t: Any, x: Any, u: Any) -> Any:
+        return jnp.concatenate([span * p.integrands(*at) for p, span, *at in self._each(t, x, u)])
+
+    def _ends(self, x0: Any, xf: Any) -> tuple[PhaseEnds, ...]:
+        ends = zip(self.split_state(x0), self.split_state(xf), self.horizons(), strict=True)
+        return tuple(PhaseEnds(a, b, *(jnp.asarray(t, x0.dtype) for t in h)) for a, b, h in ends)
+
+    def _links(self, ends: tuple[PhaseEnds, ...]) -> Array:
+        if self.links is not None:
+            return jnp.atleast_1d(self.links(ends))
+        return jnp.concatenate([b.x0 - a.xf for a, b in zip(ends[:-1], ends[1:], strict=True)])
+
+    def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        ends = self._ends(x0, xf)
+        return sum(p.endpoint_cost(*end) for p, end in zip(self.phases, ends, strict=True))
+
+    def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        """The phases' own, the links, and durations, which may not be negative."""
+        ends = self._ends(x0, xf)
+        own = [p.endpoint_constraints(*end) for p, end in zip(self.phases, ends, strict=True)]
+        durations = jnp.stack([end.tf - end.t0 for end in ends])
+        return jnp.concatenate([*own, self._links(ends), durations])
+
+    def split(self, extremal: Extremal) -> tuple[Extremal, ...]:
+        """The phases' own extremals, each in its own time. Durations must be positive."""
+        problem = extremal.problem
+        assert isinstance(problem, Phased)
+        per_state = lambda y: problem.split_state(y) if y is not None else [None] * len(self.phases)
+        per_control = lambda y: (
+            problem.split_control(y) if y is not None else [None] * len(self.phases)
+        )
+        m = extremal.multipliers
+        cut = lambda y, sizes: jnp.split(y, np.cumsum(sizes)[:-1], axis=-1)
+        path = cut(m.path, [count(p, "path_constraints") for p in problem.phases])
+        integral = cut(m.integral, [count(p, "integrands") for p in problem.phases])
+        own = [endpoint_count(p) for p in problem.phases]
+        nu = cut(m.endpoint[: sum(own)], own)
+        out = []
+        for i, (phase, (t0, tf)) in enumerate(
+            zip(problem.phases, problem.horizons(), strict=True)
+        ):
+            span = tf - t0
+            covectors = Multipliers(
+                nu[i], path[i] / span, per_state(m.state)[i] / span,
+                per_control(m.control)[i] / span, integral[i],
+            )  # fmt: skip
+            start = per_state(extremal.x)[i][0]
+            phase = dataclasses.replace(
+                phase, initial_time=t0, final_time=tf, initial_state=tuple(start)
+            )
+            out.append(
+                dataclasses.replace(
+                    extremal, t=t0 + span * extremal.t, final_time=jnp.asarray(tf),
+                    x=per_state(extremal.x)[i], u=per_control(extremal.u)[i],
+                    costate=per_state(extremal.costate)[i], multipliers=covectors, problem=phase,
+                    u_before=per_control(extremal.u_before)[i],
+                    costate_before=per_state(extremal.costate_before)[i],
+                )
+            )  # fmt: skip
+        return tuple(out)
+
+
+def _join(pairs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    return jnp.concatenate([a for a, _ in pairs]), jnp.concatenate([b for _, b in pairs])
+
+
+def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
+    """Initial entries; a free one without a guess starts where the state of that name did before."""
+    seen: dict[str, Any] = {}
+    out = []
+    for phase in phases:
+        for name, entry in zip(phase.state_names, initial_entries(phase), strict=True):
+            if is_free(entry) and entry.guess is None and name in seen:
+                entry = Free(entry.lo, entry.hi, seen[name])
+            seen[name] = start_value(entry)
+            out.append(entry)
+    return tuple(out)
+
+
+def _blank_ends(phases: tuple[Problem, ...]) -> tuple[PhaseEnds, ...]:
+    for phase in phases:
+        tf = phase.final_time
+        if not is_free(tf) and not isinstance(tf, jax.core.Tracer) and math.isinf(float(tf)):
+            raise ValueError(f"Phased: {type(phase).__name__}.final_time is infinite; give an end.")
+    zero = jnp.zeros((), jnp.result_type(float))
+    return tuple(PhaseEnds(jnp.zeros(p.n), jnp.zeros(p.n), zero, zero) for p in phases)
