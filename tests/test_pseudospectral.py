@@ -13,6 +13,7 @@ import jaxguide as jg
 from jaxguide import problems
 from jaxguide.nominal import kkt
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
+from jaxguide.nominal.pseudospectral import edges
 from jaxguide.nominal.refinement import moved
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
 from jaxguide.problems import EarthMars
@@ -49,28 +50,32 @@ class Everything(EarthMars):
         return jnp.stack([x[0] * u[0], x[1] + u[0] ** 2])
 
 
-@pytest.mark.parametrize(("family", "segments", "points"), [("lgl", 2, 5), ("lg", 2, 4)])
-def test_newton_step_against_dense_algebra(family, segments, points):
+@pytest.mark.parametrize(
+    ("family", "segments", "points", "knots"), [("lgl", 2, 5, ()), ("lg", 3, 4, (1,))]
+)
+def test_newton_step_against_dense_algebra(family, segments, points, knots):
+    ends = [1.0, 3.0, *(1.0,) * (2 if knots else 0)]
     scale = Scale(
         jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5]), jnp.asarray(2.0), jnp.array([0.1]),
-        jnp.array([1.0, 2.0]), jnp.array([1.0, 3.0]), jnp.asarray(0.7),
+        jnp.array([1.0, 2.0]), jnp.array(ends), jnp.asarray(0.7),
     )  # fmt: skip
     fractions = jnp.linspace(0.0, 1.0, segments + 1) ** 1.2
-    program = Transcription(Everything(), scale, fractions, family, points)
+    program = Transcription(Everything(), scale, edges(fractions, knots), family, points)
+    times = jnp.array([0.0, 1.6, *(0.5,) * len(knots)])
     size, rng = program.sizes, np.random.default_rng(0)
     r = lambda *shape: jnp.asarray(rng.normal(size=shape)) * 0.1
     random = lambda tree: jax.tree_util.tree_map(lambda a: r(*a.shape), tree)
     w = Primal(
         jnp.array([1.0, 0.0, 0.4]), jnp.array([[[1.0, 0.0, 0.3]]]) + r(segments, size.after, 3),
-        1 + r(segments, points, 1), jnp.array([0.0, 1.6]) + r(2), jnp.array([1.4]),
-        r(segments, points, 2), r(2),
+        1 + r(segments, points, 1), times + r(len(times)), jnp.array([1.4]),
+        r(segments, points, 2), r(len(ends)),
     )  # fmt: skip
-    y = Rows(10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(2))
+    y = Rows(10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(len(ends)))
     sigma, pull = jax.tree_util.tree_map(lambda a: jnp.abs(a) + 0.3, random(w)), random(w)
     no = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, bool), w)
     given = no._replace(
-        x0=jnp.array([True, True, False]), times=jnp.array([True, False]),
-        end=jnp.array([True, False]),
+        x0=jnp.array([True, True, False]), times=no.times.at[0].set(True),
+        end=no.end.at[0].set(True),
     )  # fmt: skip
     delta = jnp.asarray(3.0)
 

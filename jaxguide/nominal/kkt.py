@@ -1,9 +1,9 @@
 """One Newton step of a transcription: its KKT system solved by elimination, segment by segment.
 
-Within a segment the states follow from its start, its controls and the clock: one LU of the
-defects' Jacobian. What is left, a quadratic in start, controls and clock, is minimised over the
-controls from the last segment to the first (a Riccati sweep), carrying the global unknowns, the
-final state and its multiplier as parameters. A small dense system of the global unknowns ends it.
+Within a segment the defects leave a null space of start, clock and as many free directions as there
+are controls: one QR of their Jacobian. What is left, a quadratic in these, is minimised over the
+free directions from the last segment to the first (a Riccati sweep), carrying the global unknowns,
+the final state and its multiplier as parameters. A small dense system of the globals ends it.
 
 The inertia of the whole is right, so that the step descends, if every Cholesky factorisation exists
 and the last system has as many negative eigenvalues as multipliers (Haynsworth).
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, lu_factor, lu_solve
+from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.nominal.transcription import Ends, Nodes, Primal, Rows, Transcription
@@ -49,13 +49,15 @@ class Step(NamedTuple):
 
 
 class Segments(NamedTuple):
-    """States after each segment's start, linear in v = (start, controls, clock, parameters)."""
+    """States and controls after each segment's start, linear in v = (start, z, clock, parameters),
+    where z spans what the defects leave free: scaled by `size`, an orthonormal basis."""
 
-    lu: Any
+    Q: Float[Array, "segment xu row"]
+    R: Float[Array, "segment row row"]
+    size: Float[Array, "segment xu"]
     X: Float[Array, "segment after n v"]
+    U: Float[Array, "segment node m v"]
     T: Float[Array, "segment node in v"]  # the nodes' inputs
-    extra: Float[Array, "segment row v"]
-    extra_states: Float[Array, "segment row after_n"]
 
 
 class _Stage(NamedTuple):
@@ -64,11 +66,6 @@ class _Stage(NamedTuple):
     factor: Array  # Cholesky of the controls' Hessian
     N: Array
     KN: Array
-    KE: Array
-    small: Array
-    D: Array
-    E_u: Array
-    E_t: Array
     X_u: Array
     X_t: Array
     L: Array
@@ -98,39 +95,42 @@ def over_segments(f: Any, items: Any) -> Any:
 
 
 def eliminate(program: Transcription, system: System) -> Segments:
-    """States from the defects' linearisation, and what the extra rows then ask of the controls."""
+    """The defects' null space, by QR: stable however unstable the dynamics are, where following
+    the states from their start would not be."""
     rule, size = program.rule, program.sizes
-    n, C, dtype = size.n, size.nodes, system.sigma.x.dtype
+    n, m, C, S, dtype = size.n, size.m, size.nodes, size.segments, system.sigma.x.dtype
     A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
     rows, support = A.shape
     diagonal = jnp.einsum("rp,ab->rapb", A, jnp.eye(n, dtype=dtype))
     own = slice(rule.first, rule.first + C)
-    flat = lambda a: a.reshape(-1, a.shape[2])
+    count = rows * n
+    # Entries that a barrier holds count for little, so that the reduced Hessian is well scaled.
+    flat = lambda x, u: jnp.concatenate([x.reshape(S, -1), u.reshape(S, -1)], axis=1)
+    weight = jnp.sqrt(1 + flat(system.sigma.x, system.sigma.u))
 
-    def one(F: Array) -> tuple:
+    def one(item: tuple) -> tuple:
+        F, weight = item
         F = F[:, :n]
         G = diagonal.at[:, :, own].add(-jnp.einsum("rk,kab->rakb", B, F[:, :, :n]))
-        to_u = -jnp.einsum("rk,kaj->rakj", B, F[:, :, n : n + size.m]).reshape(rows, n, -1)
-        to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + size.m :])
-        right = jnp.concatenate([G[:, :, 0], to_u, to_clock], axis=2)
-        G = G[:, :, 1:].reshape(rows, n, (support - 1) * n)
-        lu = lu_factor(flat(G[rule.main]))
-        X = -lu_solve(lu, flat(right[rule.main]))
-        extra_states = flat(G[rule.extra])
-        extra = flat(right[rule.extra]) + extra_states @ X
-        return lu, X.reshape(support - 1, n, -1), extra, extra_states
+        to_u = -jnp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(count, -1)
+        to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(count, -1)
+        start, G = G[:, :, 0].reshape(count, n), G[:, :, 1:].reshape(count, -1)
+        G = jnp.concatenate([G, to_u], axis=1) / weight[None]
+        Q, R = jnp.linalg.qr(G.T, mode="complete")
+        Q1, R = Q[:, :count], R[:count]
+        follow = lambda b: -Q1 @ solve_triangular(R, b, trans=1)
+        V = jnp.concatenate([follow(start), Q[:, count:], follow(to_clock)], axis=1)
+        return Q1, R, V / weight[:, None]
 
-    lu, X, extra, extra_states = over_segments(one, system.nodes.jacobian)
-    # (x, u, clock, p) of every node from v.
-    S, _, _, nv = X.shape
-    m = size.m
+    Q, R, V = over_segments(one, (system.nodes.jacobian, weight))
+    nv = V.shape[2]
+    split = (support - 1) * n
+    X, U = V[:, :split].reshape(S, support - 1, n, nv), V[:, split:].reshape(S, C, m, nv)
     start = jnp.broadcast_to(jnp.eye(n, nv, dtype=dtype), (S, 1, n, nv))
     x = jnp.concatenate([start, X], axis=1)[:, own]
-    rest = nv - n - C * m
-    u = jnp.eye(C * m, nv, n, dtype=dtype).reshape(C, m, nv)
-    clock = jnp.broadcast_to(jnp.eye(rest, nv, n + C * m, dtype=dtype), (C, rest, nv))
-    same = jnp.broadcast_to(jnp.concatenate([u, clock], axis=1), (S, C, m + rest, nv))
-    return Segments(lu, X, jnp.concatenate([x, same], axis=2), extra, extra_states)
+    rest = system.nodes.jacobian.shape[3] - n - m
+    clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
+    return Segments(Q, R, weight, X, U, jnp.concatenate([x, U, clock], axis=2))
 
 
 def _spring(system: System) -> tuple[Array, Array]:
@@ -179,7 +179,8 @@ def _sweep(
 ) -> tuple[_Stage, Array, Bool[Array, ""]]:
     """Minimises over the controls, last segment first."""
     size = program.sizes
-    n, nu, np_, dtype = size.n, size.nodes * size.m, size.parameters, H.dtype
+    n, np_, dtype = size.n, size.parameters, H.dtype
+    nu = H.shape[1] - n - 2 - np_
     nt = size.times
     n_theta = 3 * n + nt + np_
     own, xf = slice(0, n), slice(n + nt + np_, 2 * n + nt + np_)
@@ -201,31 +202,20 @@ def _sweep(
 
     def back(carry: tuple, item: tuple) -> tuple[tuple, _Stage]:
         P, ok = carry
-        X, H, E, L = item
+        X, H, L = item
         X_u, X_t = X[:, controls], X[:, rest] @ L
-        E_u, E_t = E[:, controls], E[:, rest] @ L
         ahead = jnp.eye(n_theta, dtype=dtype).at[:n].set(X_t)  # theta after the segment
-        R = H[controls, controls] + X_u.T @ P[:n, :n] @ X_u + rho * (E_u.T @ E_u)
-        N = H[controls][:, rest] @ L + X_u.T @ (P[:n] @ ahead) + rho * (E_u.T @ E_t)
-        Q = L.T @ H[rest][:, rest] @ L + ahead.T @ P @ ahead + rho * (E_t.T @ E_t)
+        R = H[controls, controls] + X_u.T @ P[:n, :n] @ X_u
+        N = H[controls][:, rest] @ L + X_u.T @ (P[:n] @ ahead)
+        Q = L.T @ H[rest][:, rest] @ L + ahead.T @ P @ ahead
         factor = jnp.linalg.cholesky(R)
         ok = ok & jnp.all(jnp.isfinite(factor))
-        solved = cho_solve((factor, True), jnp.concatenate([N, E_u.T], axis=1))
-        KN, KE = solved[:, :n_theta], solved[:, n_theta:]
+        KN = cho_solve((factor, True), N)
         Q = Q - N.T @ KN
-        D = E_t - E_u @ KN
-        small = jnp.zeros((0, 0), dtype)
-        if E.shape[0]:
-            gram = E_u @ KE
-            # The floor only guards the rank of the extra rows.
-            floor = 1e-14 * jnp.trace(gram) * jnp.eye(E.shape[0], dtype=dtype)
-            small = jnp.linalg.cholesky(gram + floor)
-            ok = ok & jnp.all(jnp.isfinite(small))
-            Q = Q + D.T @ cho_solve((small, True), D)
-        stage = _Stage(factor, N, KN, KE, small, D, E_u, E_t, X_u, X_t, L, P)
+        stage = _Stage(factor, N, KN, X_u, X_t, L, P)
         return ((Q + Q.T) / 2, ok), stage
 
-    items = (segments.X[:, -1], H, segments.extra, L)
+    items = (segments.X[:, -1], H, L)
     (P, ok), stages = jax.lax.scan(back, (P, jnp.array(True)), items, reverse=True)
     return stages, P, ok
 
@@ -262,7 +252,7 @@ def apply(
     """The solution for one right-hand side."""
     size, rule, stages = program.sizes, program.rule, factor.stages
     n, m, S, C = size.n, size.m, size.segments, size.nodes
-    nu, np_ = C * m, size.parameters
+    np_ = size.parameters
     force, residual = load
     own = slice(rule.first, rule.first + C)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
@@ -271,37 +261,38 @@ def apply(
 
     # What the states are with all of v at zero, and the forces that this and the load leave.
     by_segment = lambda a: a.reshape(S, -1)
-    main = by_segment(residual.defect[:, rule.main])
-    x_bar = over_segments(lambda a: -lu_solve(a[0], a[1]), (segments.lu, main))
-    e_bar = by_segment(residual.defect[:, rule.extra])
-    e_bar = e_bar + jnp.einsum("sri,si->sr", segments.extra_states, x_bar)
-    x_bar = x_bar.reshape(S, -1, n)
+    xu = lambda x, u: jnp.concatenate([by_segment(x), by_segment(u)], axis=1)
+    apart = lambda a: (a[:, : size.after * n].reshape(S, -1, n), a[:, size.after * n :].reshape(S, C, m))
+
+    def particular(item: tuple) -> Array:
+        Q, R, weight, c = item
+        return -Q @ solve_triangular(R, c, trans=1) / weight
+
+    factors = (segments.Q, segments.R, segments.size)
+    x_bar, u_bar = apart(over_segments(particular, (*factors, by_segment(residual.defect))))
     at_nodes = jnp.pad(x_bar, ((0, 0), (1, 0), (0, 0)))[:, own]
-    f = jnp.einsum("skab,skb->ska", factor.W[..., :n], at_nodes)
+    at_nodes = jnp.concatenate([at_nodes, u_bar], axis=2)
+    f = jnp.einsum("skab,skb->ska", factor.W[..., : n + m], at_nodes)
     f = f + jnp.einsum("skha,skh->ska", h_q, pushed)
     on_states = force.x + (system.sigma.x + factor.delta) * x_bar
     h = jnp.einsum("skav,ska->sv", segments.T, f)
     h = h + jnp.einsum("sknv,skn->sv", segments.X, on_states)
-    h = h.at[:, n : n + nu].add(by_segment(force.u))
+    h = h + jnp.einsum("skmv,skm->sv", segments.U, force.u)
+    nu = h.shape[1] - n - 2 - np_
 
     # Backward: the linear part of the value.
     def back(p: Array, item: tuple) -> tuple[Array, tuple]:
-        s, h, x_end, e = item
+        s, h, x_end = item
         ahead = p + s.P[:, :n] @ x_end
         rest = jnp.concatenate([h[:n], h[n + nu :]])
-        h_u = h[n : n + nu] + s.X_u.T @ ahead[:n] + factor.rho * (s.E_u.T @ e)
+        h_u = h[n : n + nu] + s.X_u.T @ ahead[:n]
         h_t = s.L.T @ rest + s.X_t.T @ ahead[:n] + ahead.at[:n].set(0.0)
-        h_t = h_t + factor.rho * (s.E_t.T @ e)
         k = cho_solve((s.factor, True), h_u)
-        d = e - s.E_u @ k
-        out = h_t - s.N.T @ k
-        if e.shape[0]:
-            out = out + s.D.T @ cho_solve((s.small, True), d)
-        return out, (k, d, p)
+        return h_t - s.N.T @ k, (k, p)
 
     zero = jnp.zeros(stages.P.shape[1], h.dtype)
-    items = (stages, h, x_bar[:, -1], e_bar)
-    p, (k, d, p_after) = jax.lax.scan(back, zero, items, reverse=True)
+    items = (stages, h, x_bar[:, -1])
+    p, (k, p_after) = jax.lax.scan(back, zero, items, reverse=True)
 
     # The global unknowns.
     moving = n + size.times + np_
@@ -318,34 +309,32 @@ def apply(
 
     # Forward.
     def forward(theta: Array, item: tuple) -> tuple[Array, tuple]:
-        s, X, x_end, k, d, p_after, c = item
-        u = -(s.KN @ theta + k)
-        eta = jnp.zeros(0, theta.dtype)
-        if d.shape[0]:
-            eta = cho_solve((s.small, True), s.D @ theta + d)
-            u = u - s.KE @ eta
-        v = jnp.concatenate([theta[:n], u, c @ theta[n : n + size.times], parameters])
+        s, X, x_end, k, p_after, c = item
+        z = -(s.KN @ theta + k)
+        v = jnp.concatenate([theta[:n], z, c @ theta[n : n + size.times], parameters])
         after = theta.at[:n].set(X @ v + x_end)
-        return after, (v, eta, s.P[:n] @ after + p_after[:n])
+        return after, (v, s.P[:n] @ after + p_after[:n])
 
-    items = (stages, segments.X[:, -1], x_bar[:, -1], k, d, p_after, program.clocks)
-    _, (v, eta, costate) = jax.lax.scan(forward, theta, items)
+    items = (stages, segments.X[:, -1], x_bar[:, -1], k, p_after, program.clocks)
+    _, (v, costate) = jax.lax.scan(forward, theta, items)
     dx = jnp.einsum("sknv,sv->skn", segments.X, v) + x_bar
-    du = v[:, n : n + nu].reshape(S, C, m)
-    dq = jnp.einsum("skav,sv->ska", segments.T, v).at[:, :, :n].add(at_nodes)
+    du = jnp.einsum("skmv,sv->skm", segments.U, v) + u_bar
+    dq = jnp.einsum("skav,sv->ska", segments.T, v).at[:, :, : n + m].add(at_nodes)
 
-    # Multipliers of the main rows: the force on each state after the start must vanish.
-    f = jnp.einsum("skab,skb->ska", factor.W[:, :, :n], dq)
-    f = f + jnp.einsum("skha,skh->ska", h_q[..., :n], pushed)
-    on_states = jnp.zeros((S, size.after + 1, n), h.dtype).at[:, own].set(f)[:, 1:]
+    # Multipliers of the defects: the force on each state after the start, and control, must vanish.
+    f = jnp.einsum("skab,skb->ska", factor.W[:, :, : n + m], dq)
+    f = f + jnp.einsum("skha,skh->ska", h_q[..., : n + m], pushed)
+    on_states = jnp.zeros((S, size.after + 1, n), h.dtype).at[:, own].set(f[..., :n])[:, 1:]
     on_states = on_states + force.x + (system.sigma.x + factor.delta) * dx
     # Forces that a next segment's nodes put on a shared end are in its own value.
-    on_states = by_segment(on_states.at[:, -1].add(costate))
-    on_states = on_states + jnp.einsum("sri,sr->si", segments.extra_states, eta)
-    main = over_segments(lambda a: lu_solve(a[0], -a[1], trans=1), (segments.lu, on_states))
-    rows = jnp.zeros((S, rule.A.shape[0], n), h.dtype)
-    rows = rows.at[:, rule.main].set(main.reshape(S, -1, n))
-    rows = rows.at[:, rule.extra].set(eta.reshape(S, -1, n))
+    on_states = on_states.at[:, -1].add(costate)
+
+    def covector(item: tuple) -> Array:
+        Q, R, weight, f = item
+        return -solve_triangular(R, Q.T @ (f / weight))
+
+    rows = over_segments(covector, (*factors, xu(on_states, f[..., n:] + force.u)))
+    rows = rows.reshape(S, -1, n)
 
     # Path and endpoint slacks, from their rows.
     h_dq = jnp.einsum("skha,ska->skh", h_q, dq)
