@@ -39,33 +39,34 @@ def by_parts_defect(family: str, weight: str, points: int) -> float:
     return float(np.max(np.abs(parts - ends)))
 
 
-def mapping_matrix(family: str, weight: str, points: int) -> np.ndarray:
-    r"""Proposition 1: P with $\Lambda = P \tilde\Lambda$, found from solutions alone.
+def mapping_matrix(family: str, weight: str, points: int) -> tuple[np.ndarray, float]:
+    r"""Proposition 1: P with $\Lambda = P \tilde\Lambda$, column by column, from solutions alone.
 
-    Minimise $\int ((x - r)^2 + u^2)/2$ with $\dot x = t x + u$ for 3n random r and, where -1 is a
-    node, starts x(-1). Multipliers of B^N on one side, costates of problem B^{lambda N} with D* of
-    W* = `weight` on the other.
+    Minimise $\int ((x - r)^2 + u^2)/2$ with $\dot x = t x + u$ and, where -1 is a node, x(-1)
+    fixed. For each unit vector r is made such that B^N has it for its multipliers; the column is
+    the costate of problem B^{lambda N} for that r, with D* of W* = `weight`. Returns P, and the
+    rounding of its entries: eps times the conditions of both solves and the size of 1/w.
     """
     own = grid(family, points)
     x, w, d, n = own.x, own.w, own.differentiation, points
-    held = np.flatnonzero(x == -1.0)
-    rng = np.random.default_rng(0)
-    r, start = rng.normal(size=(n, 3 * n)), rng.normal(size=(len(held), 3 * n))
-    G = np.block([[d - np.diag(x), -np.eye(n)], [np.eye(n)[held], np.zeros((len(held), n))]])
-    m = len(G)
-    K = np.block([[np.diag(np.r_[w, w]), G.T], [G, np.zeros((m, m))]])
-    right = np.concatenate([w[:, None] * r, np.zeros((2 * n, 3 * n)), start])
-    multipliers = np.linalg.solve(K, right)[2 * n : 3 * n]
+    f = d - np.diag(x)  # B^N: f X = U; multipliers M of f X - U
+    M = np.eye(n)
+    u = M / w[:, None]  # w u - M = 0
+    states = np.linalg.solve(f, u)
+    r = states + f.T @ M / w[:, None]  # w (x - r) + f^T M = 0, no force at a fixed start
 
     # Where the start is fixed, the costate equation there is what B^N does not impose.
-    dual = weighted(x, d, weight)
+    held = np.flatnonzero(x == -1.0)
     rows = np.delete(np.arange(n), held)
-    M = np.block(
+    dual = weighted(x, d, weight) + np.diag(x)
+    system = np.block(
         [
-            [d - np.diag(x), np.eye(n)],  # u = -lambda
-            [np.eye(n)[rows], (dual + np.diag(x))[rows]],
+            [f, np.eye(n)],  # u = -lambda
+            [np.eye(n)[rows], dual[rows]],
             [np.eye(n)[held], np.zeros((len(held), n))],
         ]
     )
-    found = np.linalg.solve(M, np.concatenate([np.zeros((n, 3 * n)), r[rows], start]))
-    return np.linalg.lstsq(multipliers.T, found[n:].T, rcond=None)[0].T
+    right = np.concatenate([np.zeros((n, n)), r[rows], states[held]])
+    solves = np.linalg.cond(f) * np.linalg.cond(system)
+    rounding = float(np.finfo(float).eps * solves / np.min(w))
+    return np.linalg.solve(system, right)[n:], rounding

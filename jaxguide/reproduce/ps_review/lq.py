@@ -65,17 +65,21 @@ def end_rows(rule: Collocation, extrapolated: bool) -> np.ndarray:
     return np.eye(len(rule.support))[[0, -1]]
 
 
-def discretise(rule: Collocation, problem: Tracking, ends: np.ndarray) -> Discrete:
-    """Discretise, then dualise: the KKT system of B^N, solved at once.
+class System(NamedTuple):
+    """B^N in z = (X, U): z^T H z / 2 + cost^T z is minimised, G z = right."""
 
-    Defects A X - B F = 0 and end conditions `ends` X = x(-1), x(1) where fixed.
-    """
+    H: np.ndarray
+    cost: np.ndarray
+    G: np.ndarray
+    right: np.ndarray
+
+
+def assemble(rule: Collocation, problem: Tracking, ends: np.ndarray) -> System:
+    """Defects A X - B F = 0, then end conditions `ends` X = x(-1), x(1) where fixed."""
     n, P, C = len(problem.b), len(rule.support), len(rule.nodes)
-    a, target, eye = problem.a(rule.nodes), problem.target(rule.nodes), np.eye(n)
-    own = slice(rule.first, rule.first + C)
-    fx = np.zeros((len(rule.A), n, P, n))  # d(defect)/dX
-    fx += np.einsum("rp,ij->ripj", rule.A, eye)
-    fx[:, :, own] -= np.einsum("rc,cij->ricj", rule.B, a)
+    eye, own = np.eye(n), slice(rule.first, rule.first + C)
+    fx = np.einsum("rp,ij->ripj", rule.A, eye)  # of the defects by X
+    fx[:, :, own] -= np.einsum("rc,cij->ricj", rule.B, problem.a(rule.nodes))
     fu = -np.einsum("rc,i->ric", rule.B, problem.b)
     held = [i for i in (0, 1) if problem.fixed[i]]
     G = np.block(
@@ -84,17 +88,21 @@ def discretise(rule: Collocation, problem: Tracking, ends: np.ndarray) -> Discre
             [np.kron(ends[held], eye), np.zeros((len(held) * n, C))],
         ]
     )
-    w = np.zeros(P)
-    w[own] = rule.w
-    padded = np.zeros((P, n))
-    padded[own] = target
-    H = np.diag(np.append(np.repeat(w, n), rule.w))
-    cost = np.append(np.outer(ends[1], problem.end_cost) - w[:, None] * padded, np.zeros((C,)))
+    w, target = np.zeros(P), np.zeros((P, n))
+    w[own], target[own] = rule.w, problem.target(rule.nodes)
+    by_state = np.outer(ends[1], problem.end_cost) - w[:, None] * target
+    H = np.diag(np.concatenate([np.repeat(w, n), rule.w]))
     right = [np.zeros(len(rule.A) * n), *(problem.end(i) for i in held)]
-    z, y = kkt(H, cost, G, np.concatenate(right))
+    return System(H, np.append(by_state, np.zeros(C)), G, np.concatenate(right))
+
+
+def discretise(rule: Collocation, problem: Tracking, ends: np.ndarray) -> Discrete:
+    """Discretise, then dualise: the KKT system of B^N, one linear solve."""
+    n, P = len(problem.b), len(rule.support)
+    z, y = kkt(*assemble(rule, problem, ends))
     defect, end = np.split(y, [len(rule.A) * n])
     both = np.zeros((2, n))
-    both[held] = end.reshape(-1, n)
+    both[[i for i in (0, 1) if problem.fixed[i]]] = end.reshape(-1, n)
     return Discrete(z[: P * n].reshape(P, n), z[P * n :], defect.reshape(-1, n), both)
 
 

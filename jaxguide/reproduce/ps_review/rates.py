@@ -1,18 +1,21 @@
 r"""Rates of convergence on LGL: Theorem 2 (feasibility) and Kang's rate of the cost (section 4.3).
 
 Each state is smooth but for one jump of its derivative of order m, so it is in $W^{m,\infty}$:
-$x = \sin 2t + |t - c|^m$, signed for even m.
+$x = \sin 2t + \operatorname{sgn}(t - c) (t - c)^m$. To have it optimal, the jump is put into the
+running cost; `Saturated` has smooth data, and a control that leaves its bound.
 """
 
 import numpy as np
 
 from jaxguide.reproduce.ps_review.lq import (
     Tracking,
+    assemble,
     discretise,
     end_rows,
     objective,
     review_grid,
 )
+from jaxguide.reproduce.ps_review.qp import minimise
 from jaxguide.spectral import nodes_lg
 from jaxguide.spectral.grids import grid
 
@@ -27,7 +30,6 @@ def path(t: np.ndarray, m: int | None, order: int = 0) -> np.ndarray:
         return smooth
     d = t - KINK
     factor = np.prod(np.arange(m, m - order, -1))
-    # sgn(d)^(m+1) |d|... one sign on each side: d^m left, -d^m right is |d|^m up to sign.
     return smooth + factor * np.sign(d) * d ** (m - order)
 
 
@@ -41,8 +43,8 @@ def feasible(points: int, m: int | None) -> tuple[float, float]:
     u = path(own.x, m, 1)
     v = own.w * np.polynomial.legendre.legval(own.x, np.eye(points)[-1])
     delta = v @ u / np.sum(np.abs(v))
+    # The interpolant of what is left has degree N - 1, so that D differentiates its integral.
     x = own.integration @ (u - delta * np.sign(v))
-    # D X of this X: u less its part along v, which the residual has taken already.
     off = x + path(own.x[:1], m) - path(own.x, m)
     return abs(float(delta)), float(np.max(np.abs(off)))
 
@@ -70,6 +72,44 @@ def optimal(points: int, m: int | None) -> tuple[float, float, float]:
         off(found.x, problem.state(rule.nodes)),
         off(found.u, problem.control(rule.nodes)),
     )
+
+
+class Saturated:
+    r"""$\int_{-1}^1 (x^2 + u^2)/2\,dt$, $\dot x = u$, |u| <= 1, from where u leaves -1 at t = c.
+
+    After that u = -tanh(1 - t) x (Riccati). u has a corner, so that x is in $W^{2,\infty}$.
+    """
+
+    m = 2
+    at_corner = 1 / np.tanh(1 - KINK)
+    start = at_corner + KINK + 1
+
+    @classmethod
+    def state(cls, t: np.ndarray) -> np.ndarray:
+        later = cls.at_corner * np.cosh(1 - t) / np.cosh(1 - KINK)
+        return np.where(t < KINK, cls.start - (t + 1), later)
+
+    @classmethod
+    def value(cls) -> float:
+        until = (cls.start**3 - cls.at_corner**3) / 3 + (KINK + 1)
+        return float(until + cls.at_corner**2 * np.tanh(1 - KINK)) / 2
+
+    @classmethod
+    def errors(cls, points: int) -> tuple[float, float]:
+        """Errors of J and of x (greatest at the nodes)."""
+        zero = lambda t: np.zeros((len(t), 1))
+        state = lambda t: cls.state(t)[:, None]
+        problem = Tracking(lambda t: np.zeros((len(t), 1, 1)), np.ones(1), zero, state,
+                           zero, zero, np.zeros(1))  # fmt: skip
+        rule = review_grid("lgl", points)
+        system = assemble(rule, problem, end_rows(rule, extrapolated=False))
+        upper = np.concatenate([np.full(points, np.inf), np.ones(points)])
+        found = minimise(*system, -upper, upper)
+        if found.violation > 1e-9:
+            return np.nan, np.nan
+        x = found.z[:points]
+        value = found.z @ system.H @ found.z / 2
+        return abs(value - cls.value()), float(np.max(np.abs(x - cls.state(rule.nodes))))
 
 
 def exact(m: int | None) -> float:
