@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxguide.nominal.mesh import Collocation, collocation, left_null
-from jaxguide.reproduce.ps_review.lq import Discrete, Tracking, discretise, end_rows
+from jaxguide.reproduce.ps_review.lq import Tracking, discretise, end_rows
 from jaxguide.spectral.grids import evaluation
 
 FREQUENCY, PHASE = 3.0, 0.4

@@ -90,9 +90,9 @@ def gaussian_controls() -> Any:
             other = gaussian.solve(family, 10, extrapolated=True)
             axis.plot(other.t, other.u, "s", mfc="none", color=plot.COLOURS[1],
                       label="ends extrapolated")  # fmt: skip
-        axis.set_title(f"{title}: max |u - 1| = {found.error:.1g}")
+        axis.set_title(f"{title}: error {found.error:.0e}")
         axis.set_xlabel("t")
-        axis.set_ylim(-0.1, 2.9)
+        axis.set_ylim(-0.1, 3.2)
         axis.legend(loc="upper center")
     row[0].set_ylabel("u")
     return figure
@@ -116,8 +116,8 @@ def diagram() -> Any:
             axis.semilogy(sizes, values, label=text, **plot.line(i))
         axis.set_title(title)
         axis.set_xlabel("points")
-        axis.set_ylim(1e-17, 10)
-        axis.legend(loc="best", fontsize=7)
+        axis.set_ylim(1e-17, 1e6)
+        axis.legend(loc="upper right", fontsize=7)
     row[0].set_ylabel("relative error of the costate")
     return figure
 
@@ -141,6 +141,6 @@ def convergence() -> Any:
     right.set_title("Optimal cost")
     for axis in (left, right):
         axis.set_xlabel("points")
-        axis.legend(loc="lower left", title="dotted: promised", title_fontsize=7)
+        axis.legend(loc="center right", title="dotted: promised", title_fontsize=7)
     left.set_ylabel("error")
     return figure

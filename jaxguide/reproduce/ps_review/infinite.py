@@ -1,6 +1,6 @@
 r"""An infinite horizon: Radau nodes, W = 1 - tau, the bilinear map of eq. (6). NumPy only.
 
-Minimise $\int_0^\infty (x^2 + u^2)\,dt$ with $\dot x = x + u$, x(0) = 1. Of $x' + x^2$... the value
+Minimise $\int_0^\infty (x^2 + u^2)\,dt$ with $\dot x = x + u$, x(0) = 1. The value
 is $P x^2$ with $2P - P^2 + 1 = 0$: $J = 1 + \sqrt 2$, and $u = -P x$.
 """
 

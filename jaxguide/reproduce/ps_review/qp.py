@@ -47,4 +47,4 @@ def minimise(
     outside = np.maximum(np.maximum(lower - z, z - upper), 0.0)
     wrong = np.maximum(-bound * (active > 0), bound * (active < 0))
     parts = (np.abs(G @ z - right), slope, outside, wrong)
-    return Solution(z, y, bound, float(max(np.max(part) for part in parts)))
+    return Solution(z, y, bound, float(max(np.max(part, initial=0.0) for part in parts)))

@@ -42,13 +42,19 @@ def interpolatory_weights(x: np.ndarray) -> np.ndarray:
 def dual_interval(x: np.ndarray, w: np.ndarray) -> tuple[float, float]:
     """The gammas with w >= gamma v, v scaled so that its last entry is that of w.
 
-    v are the barycentric weights: v^T u is the divided difference of order N of u, whose interpolant
-    has degree N - 1. On LGL v = w P_N.
+    v are the barycentric weights: v^T u is the divided difference of order N of u, whose
+    interpolant has degree N - 1. On LGL v = w P_N.
     """
     v = capacity_weights(x)
     v = v * (w[-1] / v[-1])
     ratio = w / v
     return float(np.max(ratio[v < 0])), float(np.min(ratio[v > 0]))
+
+
+def condition(x: np.ndarray) -> float:
+    """How v^T u = 0 amplifies rounding in the one entry of u that it determines, at worst."""
+    v = np.abs(capacity_weights(x))
+    return float(np.sum(v) / np.min(v))
 
 
 def program(x: np.ndarray, upper: float | None = None) -> Any:

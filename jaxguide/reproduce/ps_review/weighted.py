@@ -69,7 +69,5 @@ def decay(points: int) -> tuple[float, float]:
     and W = 1."""
     x, _ = nodes_lgr(points)
     y, slope = (1 - x) / (5 - x), -4 / (5 - x) ** 2
-    off = lambda weight: float(
-        np.max(np.abs(np.asarray(_matrix(x, weight)) @ y - slope))
-    )
+    off = lambda weight: float(np.max(np.abs(np.asarray(_matrix(x, weight)) @ y - slope)))
     return off(decaying), off(constant)
