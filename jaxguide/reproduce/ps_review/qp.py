@@ -28,23 +28,31 @@ def minimise(
 
     **Source:** Hintermueller, Ito & Kunisch, SIAM J. Optim. 13 (2002), section 2.
     """
-    n, m = len(cost), len(right)
-    active = np.zeros(n, int)  # -1 at lower, 1 at upper
+    active = np.zeros(len(cost), int)  # -1 at lower, 1 at upper
+    z, y, bound = _on(active, H, cost, G, right, lower, upper)
     for _ in range(iterations):
-        free = active == 0
-        z = np.where(active < 0, lower, np.where(active > 0, upper, 0.0))
-        E, F = G[:, free], H[np.ix_(free, free)]
-        K = np.block([[F, E.T], [E, np.zeros((m, m))]])
-        known = np.concatenate([-cost[free] - H[free] @ z, right - G @ z])
-        s = np.linalg.lstsq(K, known, rcond=1e-13)[0]
-        z[free], y = s[: free.sum()], s[free.sum() :]
-        bound = np.where(free, 0.0, -(H @ z + cost + G.T @ y))
         guess = np.where(bound + z - upper > 1e-12, 1, np.where(bound + z - lower < -1e-12, -1, 0))
         if np.array_equal(guess, active):
             break
         active = guess
+        z, y, bound = _on(active, H, cost, G, right, lower, upper)
     slope = np.abs(H @ z + cost + G.T @ y + bound)
     outside = np.maximum(np.maximum(lower - z, z - upper), 0.0)
     wrong = np.maximum(-bound * (active > 0), bound * (active < 0))
     parts = (np.abs(G @ z - right), slope, outside, wrong)
     return Solution(z, y, bound, float(max(np.max(part, initial=0.0) for part in parts)))
+
+
+def _on(
+    active: np.ndarray, H: np.ndarray, cost: np.ndarray, G: np.ndarray, right: np.ndarray,
+    lower: np.ndarray, upper: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """The stationary point where the active bounds hold as equalities: z, y, bound multipliers."""
+    free, m = active == 0, len(right)
+    z = np.where(active < 0, lower, np.where(active > 0, upper, 0.0))
+    E, F = G[:, free], H[np.ix_(free, free)]
+    K = np.block([[F, E.T], [E, np.zeros((m, m))]])
+    known = np.concatenate([-cost[free] - H[free] @ z, right - G @ z])
+    s = np.linalg.lstsq(K, known, rcond=1e-13)[0]  # active rows may leave too few unknowns
+    z[free], y = s[: free.sum()], s[free.sum() :]
+    return z, y, np.where(free, 0.0, -(H @ z + cost + G.T @ y))

@@ -109,7 +109,7 @@ class Saturated:
             return np.nan, np.nan
         x = found.z[:points]
         value = found.z @ system.H @ found.z / 2
-        return abs(value - cls.value()), float(np.max(np.abs(x - cls.state(rule.nodes))))
+        return float(abs(value - cls.value())), float(np.max(np.abs(x - cls.state(rule.nodes))))
 
 
 def exact(m: int | None) -> float:
@@ -122,6 +122,6 @@ def exact(m: int | None) -> float:
     return value
 
 
-def slope(sizes: tuple[int, ...], errors: list[float]) -> float:
+def slope(sizes: tuple[int, ...], errors: np.ndarray) -> float:
     """Of the regression of log error on log(N - 1), N the review's degree: points less one."""
     return float(np.polyfit(np.log(np.array(sizes) - 2), np.log(errors), 1)[0])
