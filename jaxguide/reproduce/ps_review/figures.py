@@ -90,7 +90,7 @@ def gaussian_controls() -> Any:
             other = gaussian.solve(family, 10, extrapolated=True)
             axis.plot(other.t, other.u, "s", mfc="none", color=plot.COLOURS[1],
                       label="ends extrapolated")  # fmt: skip
-        axis.set_title(f"{title}: error {found.error:.0e}")
+        axis.set_title(f"{title}: error {found.error:.1g}")
         axis.set_xlabel("t")
         axis.set_ylim(-0.1, 3.2)
         axis.legend(loc="upper center")
@@ -139,8 +139,9 @@ def convergence() -> Any:
                 axis.loglog(sizes, promise, ":", color=plot.COLOURS[i])
     left.set_title("Theorem 2: feasible state")
     right.set_title("Optimal cost")
-    for axis in (left, right):
+    for axis, height in ((left, 0.33), (right, 0.43)):  # between the lines
         axis.set_xlabel("points")
-        axis.legend(loc="center right", title="dotted: promised", title_fontsize=7)
+        place = {"loc": "center right", "bbox_to_anchor": (1.0, height)}
+        axis.legend(title="dotted: promised", title_fontsize=7, **place)
     left.set_ylabel("error")
     return figure

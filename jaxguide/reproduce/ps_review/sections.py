@@ -293,12 +293,13 @@ def convergence(report: Report) -> None:
         "Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
     )
     for m in (2, 3, 4):
-        errors = np.array([rates.feasible(n, m) + rates.optimal(n, m)[:2] for n in rates.SIZES])
+        errors = np.array([rates.feasible(n, m) + rates.optimal(n, m) for n in rates.SIZES])
         slopes = [rates.slope(rates.SIZES, e) for e in errors.T]
         _bound(section, f"m = {m}: least residual", slopes[0], residual_rate(m))
         _bound(section, f"m = {m}: feasible state", slopes[1], state_rate(m))
         _bound(section, f"m = {m}: optimal cost", slopes[2], cost_rate(m))
         section.add(f"m = {m}: slope of the optimal state", slopes[3])
+        section.add(f"m = {m}: slope of the optimal control", slopes[4])
     errors = np.array([rates.Saturated.errors(n) for n in rates.SIZES])
     cost, state = (rates.slope(rates.SIZES, e) for e in errors.T)
     _bound(section, "|u| <= 1, m = 2: optimal cost", cost, cost_rate(2))
