@@ -10,7 +10,10 @@ from jaxguide.reproduce.report import Report as Report
 from jaxguide.reproduce.report import Row as Row
 from jaxguide.reproduce.report import Section as Section
 
-_MODULES = {"earth-mars": "jaxguide.reproduce.earth_mars"}
+_MODULES = {
+    "earth-mars": "jaxguide.reproduce.earth_mars",
+    "ps-review": "jaxguide.reproduce.ps_review",
+}
 
 
 def names() -> tuple[str, ...]:

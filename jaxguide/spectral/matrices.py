@@ -50,7 +50,8 @@ def weighted_quadrature(
 ) -> Float[Array, " n"]:
     r"""Integration weights of the W-weighted interpolant, $\int_{-1}^1 \frac{W}{W_j} \phi_j dt$.
 
-    Not the Gauss weights of the grid: they integrate W times a polynomial below degree n.
+    They integrate W times a polynomial below degree n exactly. On a Gauss grid whose own rule does
+    so too (1 - t on LGR, 1 - t^2 on LG) they are its weights.
 
     **Arguments:** as `weighted_differentiation_matrix`.
 

@@ -3,8 +3,6 @@ the low-thrust Earth-Mars transfer, computed beside the paper's Table 2 and besi
 """
 
 import contextlib
-import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -30,6 +28,7 @@ from jaxguide.reproduce.earth_mars.flights import (
 )
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.reproduce.report import Report
+from jaxguide.reproduce.stages import Stages
 from jaxguide.solving import solve
 
 SWEEP_CASES = 10_000
@@ -75,22 +74,3 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
                 shown = (extremal, exact, flights["lstsq64_interp"], reoptimised, errors)
                 report.figures = write_figures(out, *shown, dataset)
     return report
-
-
-class Stages:
-    """Names, times and shows the stages of a reproduction."""
-
-    def __init__(self, report: Report, progress: Progress, count: int):
-        self.report, self.progress, self.count, self.done = report, progress, count, 0
-        self.state = progress.init()
-
-    @contextlib.contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        began = time.perf_counter()
-        yield
-        self.report.timings[name] = time.perf_counter() - began
-        self.done += 1
-        self.state = self.progress.step(self.state, self.done / self.count)
-
-    def close(self) -> None:
-        self.progress.close(self.state)

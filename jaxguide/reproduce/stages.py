@@ -1,0 +1,27 @@
+"""The stages of a reproduction, named, timed and shown."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+from jaxguide.progress import Progress
+from jaxguide.reproduce.report import Report
+
+
+class Stages:
+    """Names, times and shows the stages of a reproduction."""
+
+    def __init__(self, report: Report, progress: Progress, count: int):
+        self.report, self.progress, self.count, self.done = report, progress, count, 0
+        self.state = progress.init()
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.report.timings[name] = time.perf_counter() - began
+        self.done += 1
+        self.state = self.progress.step(self.state, self.done / self.count)
+
+    def close(self) -> None:
+        self.progress.close(self.state)
