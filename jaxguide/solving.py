@@ -1,8 +1,10 @@
 """`jg.solve`: from a Problem to a certified Extremal."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -83,8 +85,28 @@ def _is_unconstrained(problem: Problem) -> bool:
     )
 
 
-@eqx.filter_jit
+@functools.cache
+def quick_compilation() -> dict[str, bool]:
+    """Options that halve the time it takes to compile a direct solve, for a fifth of its speed;
+    none where this XLA does not know them."""
+    options = {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda x: x, compiler_options=options).lower(1.0).compile()
+    except Exception:  # whatever the backend says of options it does not know
+        return {}
+    return options
+
+
 def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
+    return _compiled()(method, problem, guess)
+
+
+@functools.cache
+def _compiled() -> Any:
+    return eqx.filter_jit(_call, compiler_options=quick_compilation() or None)
+
+
+def _call(method: Any, problem: Problem, guess: Any) -> Extremal:
     return method(problem, guess, certifier(method.accuracy))
 
 
