@@ -96,11 +96,11 @@ class _Box(NamedTuple):
 
 
 def boxed(bounds: Bounds) -> _Box:
-    """Bounds with a little room; entries whose bounds coincide are given, but for nodal ones."""
+    """Bounds with a little room; entries whose bounds coincide are given, but for states."""
     lo, hi = bounds
     room = lambda b: _RELAX * jnp.maximum(1.0, jnp.abs(b))
     given = _tree(lambda a, b: a >= b, lo, hi)
-    given = given._replace(x=jnp.zeros_like(given.x), u=jnp.zeros_like(given.u))
+    given = given._replace(x=jnp.zeros_like(given.x))
     lo = _tree(lambda a, g: jnp.where(g, a, a - room(a)), lo, given)
     hi = _tree(lambda b, g: jnp.where(g, b, b + room(b)), hi, given)
     below = _tree(lambda a, g: jnp.isfinite(a) & ~g, lo, given)

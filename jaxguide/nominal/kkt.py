@@ -20,6 +20,7 @@ from jaxguide.nominal.transcription import Ends, Nodes, Primal, Rows, Transcript
 
 COMPLIANCE = 1e-8  # of path constraints: an equality is a spring of stiffness 1/this
 _SOFT = 1e-11
+_STIFF = 1e16  # of what holds a given control
 _REFINEMENTS = 2
 
 
@@ -106,7 +107,7 @@ def eliminate(program: Transcription, system: System) -> Segments:
     count = rows * n
     # Entries that a barrier holds count for little, so that the reduced Hessian is well scaled.
     flat = lambda x, u: jnp.concatenate([x.reshape(S, -1), u.reshape(S, -1)], axis=1)
-    weight = jnp.sqrt(1 + flat(system.sigma.x, system.sigma.u))
+    weight = jnp.sqrt(1 + flat(system.sigma.x, _on_controls(system)))
 
     def one(item: tuple) -> tuple:
         F, weight = item
@@ -133,6 +134,11 @@ def eliminate(program: Transcription, system: System) -> Segments:
     return Segments(Q, R, weight, X, U, jnp.concatenate([x, U, clock], axis=2))
 
 
+def _on_controls(system: System) -> Array:
+    """Barrier curvature of the controls; given ones hardly move."""
+    return jnp.where(system.given.u, _STIFF, system.sigma.u)
+
+
 def _spring(system: System) -> tuple[Array, Array]:
     """Stiffness of the path rows once their slacks are eliminated, and the slacks' share."""
     sigma, fixed = system.sigma.path, system.given.path
@@ -153,7 +159,7 @@ def factorise(
     W = W + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
     # Barrier and regularisation of the controls; those of the states apply to all support points.
     diagonal = jnp.zeros(W.shape[:3], delta.dtype)
-    diagonal = diagonal.at[:, :, n : n + m].set(system.sigma.u + delta)
+    diagonal = diagonal.at[:, :, n : n + m].set(_on_controls(system) + delta)
     W = W + diagonal[..., None] * jnp.eye(W.shape[2], dtype=delta.dtype)[None, None]
     flat = lambda a: a.reshape(S, -1, a.shape[3])
     T, X = segments.T, segments.X
@@ -254,6 +260,7 @@ def apply(
     n, m, S, C = size.n, size.m, size.segments, size.nodes
     np_ = size.parameters
     force, residual = load
+    force = force._replace(u=jnp.where(system.given.u, 0.0, force.u))
     own = slice(rule.first, rule.first + C)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
     stiffness, share = _spring(system)
@@ -345,7 +352,7 @@ def apply(
     primal = Primal(
         theta[:n],
         dx,
-        du,
+        jnp.where(system.given.u, 0.0, du),
         theta[n : n + size.times],
         parameters,
         jnp.where(system.given.path, 0.0, d_path),

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.linalg import solve as small_solve
-from jaxguide.nominal import interior_point
+from jaxguide.nominal import interior_point, kkt
 from jaxguide.nominal.implicit import sensitivity
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
 from jaxguide.nominal.shooting import unwrap_angles
@@ -53,6 +53,8 @@ class Pseudospectral(eqx.Module):
       `fractions`, the break points of the horizon from 0 to 1. `knots`: which of the inner ones
       (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
       others keep their places between them. For switches, kinks and junctions.
+    - `held`: (segments, m), 1 or -1 where a control is to stay at its upper or lower bound, 0
+      elsewhere: arcs of a known structure. The sign of its multiplier tells whether it should.
     - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
       (n,): delta^N of problem B^N. Zero: not at all.
     - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
@@ -73,6 +75,7 @@ class Pseudospectral(eqx.Module):
     segments: int = eqx.field(static=True, default=12)
     fractions: Any = None
     knots: tuple[int, ...] = eqx.field(static=True, default=())
+    held: Any = None
     relaxation: Any = eqx.field(static=True, default=0.0)
     time_scale: float = eqx.field(static=True, default=1.0)
     tolerance: float = eqx.field(static=True, default=1e-9)
@@ -153,7 +156,13 @@ class Pseudospectral(eqx.Module):
         unit = unit_scale(whole, len(self.knots))
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
-        program = Transcription(whole, unit, edges(fractions, self.knots), family, self.nodes)
+        held = None
+        if self.held is not None:
+            held = jnp.asarray(self.held, dtype)
+            held = jnp.pad(held, ((0, 0), (0, whole.m - held.shape[1])))
+        program = Transcription(
+            whole, unit, edges(fractions, self.knots), family, self.nodes, held
+        )
         if guess is None:
             w = straight_guess(program, fractions, self.knots)
         elif isinstance(guess, Extremal):
@@ -374,6 +383,9 @@ def to_extremal(
     t_support = node_times(program, w, rule.support)
     t = jnp.concatenate([t_support[:, :-1].reshape(-1), t_support[-1, -1:]])
     lam, before = costates(program, solution)
+    nodes, ends = program.derivatives(w)
+    left = kkt.gradient(program, nodes, ends, w, solution.y).u
+    net_u = jnp.where(box.lo.u >= box.hi.u, -left, solution.zu.u - solution.zl.u)
     to_user = scale.objective / scale.x
     # Controls and multipliers live at the nodes; the ends that are none, extrapolate them.
     spread = interpolation_matrix(jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.support, dtype))
@@ -384,11 +396,10 @@ def to_extremal(
         problem, at_nodes, x_nodes[:, : problem.n], (own_u * scale.u[None])[:, : problem.m]
     )
     turned = own_u.at[:, : problem.m].set(turned / scale.u[None, : problem.m]).reshape(w.u.shape)
-    u_lo, u_hi = box.lo.u[0, 0], box.hi.u[0, 0]
-    unbounded = jnp.isinf(u_lo) & jnp.isinf(u_hi)
-    turned = jnp.where(unbounded[None, None], turned, w.u)
+    u_lo, u_hi = box.lo.u[:, :1], box.hi.u[:, :1]
+    turned = jnp.where(jnp.isinf(u_lo) & jnp.isinf(u_hi), turned, w.u)
     u = jnp.einsum("pk,skm->spm", spread, turned)
-    u = jnp.clip(u, u_lo[None, None], u_hi[None, None])
+    u = jnp.clip(u, u_lo, u_hi)
     spans = program.clocks @ w.times
     rate = (spans[:, 1] - spans[:, 0]) / 2  # dt/dtau, scaled
     clock = rate[:, None, None] * scale.t
@@ -430,7 +441,7 @@ def to_extremal(
             nu[:q],
             over_nodes(solution.y.path) / scale.path[None],
             state[:, :k],
-            (over_nodes(solution.zu.u - solution.zl.u) / scale.u[None])[:, :m],
+            (over_nodes(net_u) / scale.u[None])[:, :m],
             nu[q : q + r],
         ),
         result=result,

@@ -95,6 +95,7 @@ class Transcription(eqx.Module):
     edges: Float[Array, "edge clock"]
     family: str = eqx.field(static=True)
     points: int = eqx.field(static=True)
+    held: Float[Array, "segment m"] | None = None  # -1, 1: control held at that bound
 
     @property
     def rule(self) -> Collocation:
@@ -289,11 +290,16 @@ def bounds(program: Transcription) -> Bounds:
     end = bounds_of(problem.endpoint_bounds, size.end - len(program.order), dtype)
     apart = (jnp.full(len(program.order), _APART, dtype), jnp.full(len(program.order), jnp.inf, dtype))
 
+    u = [over(b / scale.u, size.segments, size.nodes) for b in controls]
+    if program.held is not None:
+        at = program.held[:, None]
+        u = [jnp.where(at > 0, u[1], u[0]), jnp.where(at < 0, u[0], u[1])]
+
     def side(i: int) -> Primal:
         return Primal(
             x0[i] / scale.x,
             over(states[i] / scale.x, size.segments, size.after),
-            over(controls[i] / scale.u, size.segments, size.nodes),
+            u[i],
             jnp.stack([t[i] for t in times]) / scale.t,
             (jnp.stack([v[i] for v in p]) if p else jnp.zeros(0, dtype)) / scale.p,
             over(path[i] / scale.path, size.segments, size.nodes),

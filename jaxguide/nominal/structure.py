@@ -1,0 +1,74 @@
+"""The arcs of an extremal: where bounds and constraints become active or let go. Host only."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxguide.problem import bounds_of
+from jaxguide.spectral import legendre_matrix
+from jaxguide.trajectory import Extremal
+
+_NEAR = 1e-4  # of a constraint's range: as near as this it is active
+_LEAST = 2  # nodes an arc holds; what is shorter is the blur of a junction
+
+
+class Arcs(NamedTuple):
+    """`junctions`: times between arcs. `active`: what each arc holds, component by component: -1 at
+    its lower bound, 1 at its upper, 0 between."""
+
+    junctions: Float[np.ndarray, " junction"]
+    active: Float[np.ndarray, "arc component"]
+    names: tuple[str, ...]
+
+
+def arcs(extremal: Extremal) -> Arcs:
+    """The active sets along `extremal`, from its nodes."""
+    problem = extremal.problem
+    # Points that are no nodes of the quadrature hold extrapolated controls.
+    inverse = np.asarray(legendre_matrix(extremal.reference_nodes))
+    own = np.abs(inverse[0]) > 1e-9
+    t, x, u = (np.asarray(a) for a in _by_segment(extremal))
+    flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
+    t, x, u = flat(t), flat(x), flat(u)
+    h = np.asarray(jax.vmap(problem.path_constraints)(t, x, u))
+    labels, names = [], []
+    for prefix, kinds, values, bounds in (
+        ("", problem.control_names, u, problem.control_bounds),
+        ("", problem.state_names, x, problem.state_bounds),
+        ("path ", tuple(map(str, range(h.shape[1]))), h, problem.path_bounds),
+    ):
+        lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
+        span = np.where(np.isfinite(hi - lo), hi - lo, np.ptp(values, axis=0) + 1e-12)
+        at = np.where(values - lo <= _NEAR * span, -1, 0) + np.where(
+            hi - values <= _NEAR * span, 1, 0
+        )
+        labels.append(at)
+        names += [prefix + k for k in kinds]
+    return _cut(t, np.concatenate(labels, axis=1), tuple(names))
+
+
+@jax.jit
+def _by_segment(extremal: Extremal):
+    return (
+        extremal.by_segment(extremal.t[:, None])[..., 0],
+        extremal.by_segment(extremal.x),
+        extremal.control_by_segment(),
+    )
+
+
+def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
+    """Runs of equal labels; short ones are shared out between their neighbours."""
+    starts = np.concatenate([[0], 1 + np.flatnonzero(np.any(np.diff(labels, axis=0), axis=1))])
+    ends = np.append(starts[1:], len(t))
+    long = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= _LEAST]
+    merged: list[tuple[int, int]] = []
+    for a, b in long:
+        if merged and np.array_equal(labels[merged[-1][0]], labels[a]):
+            merged[-1] = (merged[-1][0], b)
+        else:
+            merged.append((a, b))
+    junctions = [(t[b - 1] + t[a]) / 2 for (_, b), (a, _) in zip(merged, merged[1:], strict=False)]
+    active = [labels[a] for a, _ in merged]
+    return Arcs(np.array(junctions), np.array(active), names)
