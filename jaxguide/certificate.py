@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, conjugate_ahead, solve_sweeps
 from jaxguide.nominal.conditions import endpoint_lagrangian
+from jaxguide.nominal.wrappers import closed
 from jaxguide.problem import (
     Problem,
     bounds_of,
@@ -145,13 +146,16 @@ def certifier(tolerance: float) -> Callable[[Extremal], Certificate]:
 def constrained_hamiltonian(
     problem: Problem, t: Any, x: Array, u: Array, costate: Array, held: Array
 ) -> Float[Array, ""]:
-    """H with the multipliers `held` of path constraints, states and controls: review, H bar."""
-    h = problem.path_constraints(t, x, u)
-    return hamiltonian(problem, t, x, u, costate) + jnp.dot(held, jnp.concatenate([h, x, u]))
+    """H with the multipliers `held` of path constraints, states, controls and integrals: review,
+    H bar."""
+    h, r = problem.path_constraints(t, x, u), problem.integrands(t, x, u)
+    return hamiltonian(problem, t, x, u, costate) + jnp.dot(held, jnp.concatenate([h, x, u, r]))
 
 
 @eqx.filter_jit
 def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
+    if extremal.stretch is not None:
+        extremal = closed(extremal)
     problem, t = extremal.problem, extremal.t
     x, u, costate = extremal.x, extremal.u, extremal.costate
     rows = _Rows()
@@ -180,7 +184,9 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     u_parts, lam_parts = extremal.control_by_segment(), extremal.costate_by_segment()
     gx, gu, glam = at(extremal.by_segment(x)), at(u_parts), at(lam_parts)
     multipliers = extremal.multipliers
-    held = jnp.concatenate([multipliers.path, multipliers.state, multipliers.control], axis=1)
+    integral = jnp.broadcast_to(multipliers.integral, (len(t), len(multipliers.integral)))
+    constraints = (multipliers.path, multipliers.state, multipliers.control)
+    held = jnp.concatenate([*constraints, integral], axis=1)
     gheld = at(extremal.by_segment(held))
     over = lambda f: jax.vmap(jax.vmap(lambda t, x, u, c, k: f(problem, t, x, u, c, k)))
     f = over(lambda p, t, x, u, c, k: p.dynamics(t, x, u))(times, gx, gu, glam, gheld)
@@ -214,7 +220,11 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
         rows.add("transversality, start", costates, gap[None], t0[None], tight)
 
     # The Hamiltonian: stationary in u, and dH/dt = H_t along the extremal.
-    h_node = jax.vmap(hamiltonian, in_axes=(None, 0, 0, 0, 0))(problem, t, x, u, costate)
+    def value(t: Any, x: Array, u: Array, costate: Array) -> Array:
+        gain = jnp.dot(multipliers.integral, problem.integrands(t, x, u))
+        return hamiltonian(problem, t, x, u, costate) + gain
+
+    h_node = jax.vmap(value)(t, x, u, costate)
     h_scale = 1e-3 * lam_span + jnp.max(jnp.abs(h_node))
     if is_free(problem.final_time):
         rows.add(
@@ -224,6 +234,16 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
     gap = (h_node[step::step] - h_node[0] - drift) / h_scale
     rows.add("Hamiltonian rate", ("H",), gap[:, None], breaks[1:], tight)
+    if is_free(problem.final_time):
+        # Where controls jump between nodes the pointwise value misleads; its mean, by the nodes'
+        # own quadrature, does not (reference: 1/2 sum w lambda^T f).
+        own = legendre_matrix(extremal.reference_nodes)[0]
+        of_parts = lambda t, x, u, c: jax.vmap(jax.vmap(value))(t, x, u, c)
+        parts = of_parts(extremal.by_segment(t[:, None])[..., 0], extremal.by_segment(x), u_parts, lam_parts)
+        mean = jnp.sum(2 * half * (parts @ own)) / (tf - t0)
+        ahead = drift[-1] - jnp.concatenate([jnp.zeros(1, t.dtype), drift[:-1]])
+        ahead = jnp.sum(half * 2 * ahead) / (tf - t0)
+        rows.add("H on average", ("H",), ((mean + ahead + g[3]) / h_scale)[None, None], tf[None], tight)
     h_u = jax.vmap(jax.grad(constrained_hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0, 0))(
         problem, t, x, u, costate, held
     )
@@ -251,6 +271,14 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
         labels = labels or [f"path {i}" for i in range(values.shape[1])]
         rows.add(name, labels, over_by, t, tight)
 
+    rows.add(
+        "complementarity",
+        tuple(f"path {i}" for i in range(multipliers.path.shape[1])) + states + problem.control_names,
+        _complementarity(extremal) / h_scale,
+        t,
+        tight,
+    )
+
     # Spectral tail: the last two Legendre coefficients of each segment's polynomial.
     inverse = legendre_matrix(extremal.reference_nodes)[-2:]
     tail = lambda v, s: (
@@ -262,6 +290,24 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     )
     rows.add("spectral tail, costate", costates, tail(lam_parts, lam_span), breaks[1:], tight)
     return rows.done()
+
+
+def _complementarity(extremal: Extremal) -> Float[Array, "node constraint"]:
+    """Multiplier times distance from the bound that its sign names: zero where bounds are active
+    with the right sign, or let go."""
+    problem, m = extremal.problem, extremal.multipliers
+    h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
+    sides = []
+    for values, bounds, multiplier in (
+        (h, problem.path_bounds, m.path),
+        (extremal.x, problem.state_bounds, m.state),
+        (extremal.u, problem.control_bounds, m.control),
+    ):
+        lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
+        distance = jnp.where(multiplier > 0, hi[None] - values, values - lo[None])
+        # Beyond a size of one, as for a bound at infinity, the multiplier alone counts.
+        sides.append(jnp.abs(multiplier) * jnp.clip(distance, 0.0, 1.0))
+    return jnp.concatenate(sides, axis=1)
 
 
 def _cost_scale(extremal: Extremal) -> Array:

@@ -1,6 +1,7 @@
 """`jg.solve`: from a Problem to a certified Extremal."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.certificate import certifier
-from jaxguide.nominal.pseudospectral import Pseudospectral
+from jaxguide.nominal.pseudospectral import Pseudospectral, finished
 from jaxguide.nominal.refinement import refined
 from jaxguide.nominal.shooting import Shooting
 from jaxguide.nominal.wrappers import closed, endless, opened
@@ -18,7 +19,13 @@ from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
 
-def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool = True) -> Extremal:
+def solve(
+    problem: Problem,
+    method: Any = None,
+    guess: Any = None,
+    throw: bool = True,
+    watch: Callable[[Any], None] | None = None,
+) -> Extremal:
     """Solves `problem` for an extremal that carries its own certificate.
 
     **Arguments:**
@@ -29,6 +36,8 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
       the Problem has bounds, path constraints or what else shooting cannot do. Where its bounds
       are traced that cannot be seen: name the method, or look for `bounds_violated`.
     - `guess`: None, an Extremal of a similar problem, or initial costates (n,).
+    - `watch`: called after each solve of a direct method's refinement with what it is and how
+      good, such as `print`. Not under a trace.
     - `throw`: raise if it fails. Under a trace nothing is raised; look at `.result`.
 
     **Raises:** `ValueError` for a badly stated problem, `RuntimeError` without float64,
@@ -52,7 +61,7 @@ def solve(problem: Problem, method: Any = None, guess: Any = None, throw: bool =
         return opened(extremal) if without_end else extremal
     extremal = _run(method, problem, guess)
     if direct and method.refinements:
-        extremal = refined(_run, method, problem, extremal)
+        extremal = refined(_run, method, problem, extremal, watch or (lambda _: None))
     if without_end:
         extremal = opened(extremal)
     if throw:
@@ -98,16 +107,25 @@ def quick_compilation() -> dict[str, bool]:
 
 
 def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
-    return _compiled()(method, problem, guess)
+    if not isinstance(method, Pseudospectral):
+        return _whole(method, problem, guess)
+    # In two programs, so that the optimiser's serves every guess and every mesh of its size.
+    return _quick(finished)(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
+
+
+@eqx.filter_jit
+def _whole(method: Any, problem: Problem, guess: Any) -> Extremal:
+    return method(problem, guess, certifier(method.accuracy))
+
+
+@eqx.filter_jit
+def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
+    return method.prepared(problem, guess)
 
 
 @functools.cache
-def _compiled() -> Any:
-    return eqx.filter_jit(_call, compiler_options=quick_compilation() or None)
-
-
-def _call(method: Any, problem: Problem, guess: Any) -> Extremal:
-    return method(problem, guess, certifier(method.accuracy))
+def _quick(function: Callable[..., Any]) -> Callable[..., Any]:
+    return eqx.filter_jit(function, compiler_options=quick_compilation() or None)
 
 
 def raise_if_failed(extremal: Extremal) -> None:

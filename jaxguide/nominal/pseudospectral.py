@@ -25,7 +25,7 @@ from jaxguide.nominal.transcription import (
     constraint_counts,
     node_times,
 )
-from jaxguide.nominal.wrappers import Endless, count, relaxed, with_integrals
+from jaxguide.nominal.wrappers import Endless, relaxed, rewrapped, with_integrals
 from jaxguide.problem import (
     Problem,
     bounds_of,
@@ -128,14 +128,7 @@ class Pseudospectral(eqx.Module):
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
-        program, start = jax.lax.stop_gradient(self.prepared(problem, guess))
-        # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
-        mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
-        options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
-        whole = self.whole(problem)
-        solution = _solved(whole, program, start, options)
-        program = eqx.tree_at(lambda p: p.problem, program, whole)
-        return to_extremal(problem, program, bounds(program), solution, certifier)
+        return finished(problem, *self.prepared(problem, guess), certifier)
 
     def whole(self, problem: Problem) -> Problem:
         """`problem` with what the transcription needs besides: integrals, relaxed dynamics."""
@@ -145,8 +138,10 @@ class Pseudospectral(eqx.Module):
         delta = jnp.broadcast_to(jnp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
         return relaxed(whole, jnp.pad(delta, (0, whole.n - problem.n)))
 
-    def prepared(self, problem: Problem, guess: Any) -> tuple[Transcription, Primal]:
-        """The transcription in designer units, and where the search starts."""
+    def prepared(
+        self, problem: Problem, guess: Any
+    ) -> tuple[Transcription, Primal, interior_point.Options]:
+        """The transcription in designer units, where the search starts, and how."""
         dtype = jnp.result_type(float)
         whole = self.whole(problem)
         if self.fractions is None:
@@ -176,7 +171,26 @@ class Pseudospectral(eqx.Module):
         program = eqx.tree_at(lambda p: p.scale, program, scale)
         w = jax.tree_util.tree_map(jnp.divide, w, program.units)
         node, end = program.values(w)
-        return program, w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+        w = w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+        # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
+        mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
+        options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
+        return *jax.lax.stop_gradient((program, w)), jax.tree_util.tree_map(jnp.asarray, options)
+
+
+def finished(
+    problem: Problem,
+    program: Transcription,
+    start: Primal,
+    options: interior_point.Options,
+    certifier: Any,
+) -> Extremal:
+    """What the optimiser makes of `Pseudospectral.prepared`: one program for every guess, break
+    and scale."""
+    whole = rewrapped(program.problem, problem)
+    solution = _solved(whole, program, start, options)
+    program = eqx.tree_at(lambda p: p.problem, program, whole)
+    return to_extremal(problem, program, bounds(program), solution, certifier)
 
 
 def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:

@@ -1,7 +1,11 @@
-"""Moving and refining a mesh until its segments carry small and equal errors. Host only."""
+"""The spectral algorithm around a direct solve: better meshes, junctions as free knots, and when to
+stop. Host only.
+
+**Source:** review, section 4.4 and the remarks on knots.
+"""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,15 +14,40 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.nominal.pseudospectral import Pseudospectral
-from jaxguide.problem import Problem
-from jaxguide.spectral import differentiation_matrix, interpolation_matrix, nodes_lg
+from jaxguide.nominal.structure import Arcs, arcs
+from jaxguide.nominal.wrappers import Endless
+from jaxguide.problem import Problem, hamiltonian
+from jaxguide.spectral import (
+    differentiation_matrix,
+    interpolation_matrix,
+    legendre_matrix,
+    nodes_lg,
+)
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS
 
 # How strongly breaks follow the error, and the share that smooth segments keep of the worst one's:
 # first choices, tried on five problems of the library and not tuned.
 _POWER, _FLOOR = 1 / 3, 0.03
-_MOVES = 2  # of the mesh before it is doubled
+_MOST_NODES, _MOST_SEGMENTS = 14, 96
+_MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise
+_KNOTTED_NODES, _SEGMENTS_A_HORIZON = 12, 8  # of the mesh with free knots
+
+
+class Progress(NamedTuple):
+    """One solve of the ladder, for whoever watches."""
+
+    step: str
+    extremal: Extremal
+    error: float
+
+    def __str__(self) -> str:
+        e = self.extremal
+        reason = RESULTS[e.result] or "converged"
+        return (
+            f"{self.step}: {len(e.breaks) - 1} segments of degree {e.degree}, "
+            f"objective {float(e.objective):.12g}, defect between nodes {self.error:.1e}, {reason}"
+        )
 
 
 @eqx.filter_jit
@@ -40,6 +69,20 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     return jnp.max(gap / span[None], axis=1)
 
 
+@eqx.filter_jit
+def tails(extremal: Extremal) -> Float[Array, ""]:
+    """Largest of the last two Legendre coefficients of state and costate, relative to their size:
+    by Jackson's theorem what a finer grid could still change."""
+    last = legendre_matrix(extremal.reference_nodes)[-2:]
+    parts = (extremal.by_segment(extremal.x), extremal.costate_by_segment())
+    spans = (1e-3 + jnp.max(jnp.abs(extremal.x), axis=0), jnp.max(jnp.abs(extremal.costate)))
+    sizes = [
+        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", last, v)) / s)
+        for v, s in zip(parts, (spans[0][None, None], spans[1] + 1e-300), strict=True)
+    ]
+    return jnp.maximum(*sizes)
+
+
 def moved(
     fractions: Float[np.ndarray, " edge"], errors: Float[np.ndarray, " segment"], segments: int
 ) -> Float[np.ndarray, " new_edge"]:
@@ -56,24 +99,116 @@ def refined(
     method: Pseudospectral,
     problem: Problem,
     extremal: Extremal,
+    watch: Callable[[Progress], None],
 ) -> Extremal:
-    """`extremal` again on better meshes, each from the last, until `mesh_tolerance` is met, the
-    refinements are used up, or a solve fails (the last good one is then kept)."""
+    """`extremal` again on better meshes, each from the last, until state and costate are resolved
+    to `mesh_tolerance`, the refinements are used up, or a solve fails (the last good one is kept).
+
+    First the breaks move to where the error is. Then, where controls switch between bounds, the
+    junctions become free knots and the controls stay on their bounds between them: exact to
+    rounding if that is the structure, and taken only if the certificate's own measures agree. A
+    smooth solution gets more nodes; what is left, more segments.
+    """
+    error = float(jnp.max(segment_errors(extremal)))
+    watch(Progress("first mesh", extremal, error))
+    original = method
     for k in range(method.refinements):
         errors = np.asarray(segment_errors(extremal))
-        good = bool(extremal.result == RESULTS.successful)
-        if not good or not np.all(np.isfinite(errors)) or errors.max() <= method.mesh_tolerance:
+        if extremal.result != RESULTS.successful or not np.all(np.isfinite(errors)):
             break
-        breaks = np.asarray(extremal.breaks)
-        fractions = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
-        segments = len(fractions) - 1
-        if k % (_MOVES + 1) == _MOVES:
-            segments *= 2
-        where = lambda m: (m.fractions,)
-        fractions = moved(fractions, errors, segments)
-        method = eqx.tree_at(where, method, (fractions,), is_leaf=lambda v: v is None)
+        found = arcs(extremal)
+        if k == 1 or (k == 0 and errors.max() <= method.mesh_tolerance):
+            exact = structured(run, original, problem, extremal, found, watch)
+            if exact is not None:
+                return exact
+        resolved = errors.max() <= method.mesh_tolerance
+        if resolved and (len(found.junctions) or float(tails(extremal)) <= method.mesh_tolerance):
+            break
+        fractions = _fractions(extremal)
+        segments, nodes = len(fractions) - 1, method.nodes
+        smooth = not len(found.junctions) and nodes < _MOST_NODES
+        if k in (0, 2) and not (smooth and resolved):
+            step = "breaks moved"
+        elif smooth:
+            step, nodes = "more nodes", min(nodes + 4, _MOST_NODES)
+        elif 2 * segments <= _MOST_SEGMENTS:
+            step, segments = "more segments", 2 * segments
+        else:
+            break
+        method = _meshed(method, moved(fractions, errors, segments), nodes)
         better = run(method, problem, extremal)
-        if not bool(better.result == RESULTS.successful):
+        error = float(jnp.max(segment_errors(better)))
+        watch(Progress(step, better, error))
+        if better.result != RESULTS.successful:
             break
         extremal = better
     return extremal
+
+
+def _fractions(extremal: Extremal) -> np.ndarray:
+    breaks = np.asarray(extremal.breaks)
+    return (breaks - breaks[0]) / (breaks[-1] - breaks[0])
+
+
+def _meshed(
+    method: Pseudospectral, fractions: np.ndarray, nodes: int, knots: tuple = (), held: Any = None
+) -> Pseudospectral:
+    return Pseudospectral(
+        method.grid, nodes, len(fractions) - 1, fractions, knots, held, method.relaxation,
+        method.time_scale, method.tolerance, method.max_iterations, 0, method.mesh_tolerance,
+    )  # fmt: skip
+
+
+def structured(
+    run: Callable[[Any, Problem, Any], Extremal],
+    method: Pseudospectral,
+    problem: Problem,
+    extremal: Extremal,
+    found: Arcs,
+    watch: Callable[[Progress], None],
+) -> Extremal | None:
+    """The extremal of the structure `found`, or None where that is not clear, or not better."""
+    m, junctions = problem.m, found.junctions
+    switches = np.any(np.diff(found.active[:, :m], axis=0), axis=1)
+    if not 0 < len(junctions) <= _MOST_JUNCTIONS or not switches.any():
+        return None
+    if isinstance(problem, Endless):
+        return None
+    affine = _affine(extremal)
+    t0, tf = float(extremal.t[0]), float(extremal.t[-1])
+    main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
+    breaks, knots, held = [0.0], [], []
+    for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
+        # A singular arc gets one polynomial: more would let its control chatter.
+        singular = affine & (found.active[arc, :m] == 0)
+        count = 1 if singular.any() else max(1, int(np.ceil(_SEGMENTS_A_HORIZON * (b - a))))
+        breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
+        held += [found.active[arc, :m]] * count
+        if arc < len(switches) and switches[arc]:
+            knots.append(len(breaks) - 1)
+    breaks[-1] = 1.0
+    knotted = _meshed(
+        method, np.array(breaks), _KNOTTED_NODES, tuple(knots), np.array(held, float)
+    )
+    exact = run(knotted, problem, extremal)
+    error = float(jnp.max(segment_errors(exact)))
+    watch(Progress("free knots", exact, error))
+    before = float(jnp.max(segment_errors(extremal)))
+    good = exact.result == RESULTS.successful and error <= max(method.mesh_tolerance, 0.0)
+    if not good or error > before and error > 1e-9:
+        return None
+    rows = {row["check"]: row["passed"] for row in exact.certificate.rows()}
+    sound = rows["complementarity"] and rows["stationarity H_u"] and rows["control bounds"]
+    return exact if sound and rows["state bounds"] else None
+
+
+@eqx.filter_jit
+def _curvature(extremal: Extremal) -> Float[Array, "node m"]:
+    along = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))
+    at = (extremal.problem, extremal.t, extremal.x, extremal.u, extremal.costate)
+    return jnp.max(jnp.abs(along(*at)), axis=2)
+
+
+def _affine(extremal: Extremal) -> np.ndarray:
+    """Which controls H is linear in."""
+    return np.asarray(jnp.max(_curvature(extremal), axis=0)) <= 1e-12

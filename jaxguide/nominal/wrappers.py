@@ -81,6 +81,17 @@ def endpoint_count(problem: Problem) -> int:
     return jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
 
 
+def rewrapped(whole: Problem, problem: Problem) -> Problem:
+    """`whole` around `problem` itself, whose derivatives count."""
+    if type(whole) not in (WithIntegrals, Relaxed):
+        return problem
+    assert isinstance(whole, Wrapped)
+    inner = rewrapped(whole.inner, problem)
+    if isinstance(whole, WithIntegrals):
+        return with_integrals(inner)
+    return relaxed(inner, whole.control_bounds[1][inner.m :])
+
+
 class WithIntegrals(Wrapped):
     """`inner` with each of its integrals as a state that starts at zero and ends within bounds."""
 
