@@ -165,6 +165,9 @@ def factorise(
     T, X = segments.T, segments.X
     H = jnp.einsum("siv,siw->svw", flat(T), flat(jnp.einsum("skab,skbv->skav", W, T)))
     H = H + jnp.einsum("siv,siw->svw", flat(X), flat((system.sigma.x + delta)[..., None] * X))
+    if program.smooth is not None:
+        of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
+        H = H + jnp.einsum("skmv,skmw->svw", segments.U, of_columns(segments.U))
     stages, P, convex = _sweep(program, segments, H, rho)
     K, held = _globals(program, system, P, delta)
     size_ = jnp.sqrt(jnp.max(jnp.abs(K), axis=1) + 1e-300)
@@ -280,6 +283,7 @@ def apply(
     at_nodes = jnp.pad(x_bar, ((0, 0), (1, 0), (0, 0)))[:, own]
     at_nodes = jnp.concatenate([at_nodes, u_bar], axis=2)
     f = jnp.einsum("skab,skb->ska", factor.W[..., : n + m], at_nodes)
+    f = f.at[:, :, n : n + m].add(program.roughness(u_bar))
     f = f + jnp.einsum("skha,skh->ska", h_q, pushed)
     on_states = force.x + (system.sigma.x + factor.delta) * x_bar
     h = jnp.einsum("skav,ska->sv", segments.T, f)
@@ -330,6 +334,7 @@ def apply(
 
     # Multipliers of the defects: the force on each state after the start, and control, must vanish.
     f = jnp.einsum("skab,skb->ska", factor.W[:, :, : n + m], dq)
+    f = f.at[:, :, n:].add(program.roughness(du))
     f = f + jnp.einsum("skha,skh->ska", h_q[..., : n + m], pushed)
     on_states = jnp.zeros((S, size.after + 1, n), h.dtype).at[:, own].set(f[..., :n])[:, 1:]
     on_states = on_states + force.x + (system.sigma.x + factor.delta) * dx
@@ -372,6 +377,7 @@ def product(program: Transcription, system: System, delta: Array, step: Step) ->
     on_q = on_q + jnp.einsum("skab,skb->ska", system.node_hessian, dq)
     on_b = on_b + system.end_hessian @ db
     force = gather(program, dw, on_q, on_b, on_support)
+    force = force._replace(u=force.u + program.roughness(dw.u))
     springs = lambda f, s, d, g: jnp.where(g, 0.0, f + (s + delta) * d)
     own = jax.tree_util.tree_map(springs, force, system.sigma, dw, system.given)
     slack = lambda y, s, d, g: jnp.where(g, 0.0, -y + s * d)
@@ -413,7 +419,8 @@ def gather(
 def gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Rows) -> Primal:
     """Of the Lagrangian f + y^T c, from Jacobians at hand."""
     on_unknowns = gather(program, w, *forces(program, nodes, ends, y, 1.0))
-    return on_unknowns._replace(path=-y.path, end=-y.end)
+    on_controls = on_unknowns.u + program.roughness(w.u)
+    return on_unknowns._replace(u=on_controls, path=-y.path, end=-y.end)
 
 
 def solve(

@@ -55,6 +55,9 @@ class Pseudospectral(eqx.Module):
       others keep their places between them. For switches, kinks and junctions.
     - `held`: (segments, m), 1 or -1 where a control is to stay at its upper or lower bound, 0
       elsewhere: arcs of a known structure. The sign of its multiplier tells whether it should.
+    - `smooth`: (segments, m), weights of the squares of the upper half of each control's Legendre
+      coefficients, added to the objective: for singular arcs, where nothing else keeps a control
+      from oscillating. Where the true control is smooth its share of the objective vanishes.
     - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
       (n,): delta^N of problem B^N. Zero: not at all.
     - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
@@ -76,6 +79,7 @@ class Pseudospectral(eqx.Module):
     fractions: Any = None
     knots: tuple[int, ...] = eqx.field(static=True, default=())
     held: Any = None
+    smooth: Any = None
     relaxation: Any = eqx.field(static=True, default=0.0)
     time_scale: float = eqx.field(static=True, default=1.0)
     tolerance: float = eqx.field(static=True, default=1e-9)
@@ -151,12 +155,10 @@ class Pseudospectral(eqx.Module):
         unit = unit_scale(whole, len(self.knots))
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
-        held = None
-        if self.held is not None:
-            held = jnp.asarray(self.held, dtype)
-            held = jnp.pad(held, ((0, 0), (0, whole.m - held.shape[1])))
+        wide = lambda a: jnp.pad(jnp.asarray(a, dtype), ((0, 0), (0, whole.m - np.shape(a)[1])))
+        held, smooth = (None if a is None else wide(a) for a in (self.held, self.smooth))
         program = Transcription(
-            whole, unit, edges(fractions, self.knots), family, self.nodes, held
+            whole, unit, edges(fractions, self.knots), family, self.nodes, held, smooth
         )
         if guess is None:
             w = straight_guess(program, fractions, self.knots)

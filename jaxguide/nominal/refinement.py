@@ -31,6 +31,7 @@ from jaxguide.types import RESULTS
 _POWER, _FLOOR = 1 / 3, 0.03
 _MOST_NODES, _MOST_SEGMENTS = 14, 96
 _MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise
+_SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
 _KNOTTED_NODES, _SEGMENTS_A_HORIZON = 12, 8  # of the mesh with free knots
 
 
@@ -151,10 +152,15 @@ def _fractions(extremal: Extremal) -> np.ndarray:
 
 
 def _meshed(
-    method: Pseudospectral, fractions: np.ndarray, nodes: int, knots: tuple = (), held: Any = None
+    method: Pseudospectral,
+    fractions: np.ndarray,
+    nodes: int,
+    knots: tuple = (),
+    held: Any = None,
+    smooth: Any = None,
 ) -> Pseudospectral:
     return Pseudospectral(
-        method.grid, nodes, len(fractions) - 1, fractions, knots, held, method.relaxation,
+        method.grid, nodes, len(fractions) - 1, fractions, knots, held, smooth, method.relaxation,
         method.time_scale, method.tolerance, method.max_iterations, 0, method.mesh_tolerance,
     )  # fmt: skip
 
@@ -177,19 +183,21 @@ def structured(
     affine = _affine(extremal)
     t0, tf = float(extremal.t[0]), float(extremal.t[-1])
     main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
-    breaks, knots, held = [0.0], [], []
+    breaks, knots, held, smooth = [0.0], [], [], []
     for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
         # A singular arc gets one polynomial: more would let its control chatter.
         singular = affine & (found.active[arc, :m] == 0)
         count = 1 if singular.any() else max(1, int(np.ceil(_SEGMENTS_A_HORIZON * (b - a))))
         breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
         held += [found.active[arc, :m]] * count
+        smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
     knotted = _meshed(
-        method, np.array(breaks), _KNOTTED_NODES, tuple(knots), np.array(held, float)
-    )
+        method, np.array(breaks), _KNOTTED_NODES, tuple(knots), np.array(held, float),
+        np.array(smooth) if np.any(smooth) else None,
+    )  # fmt: skip
     exact = run(knotted, problem, extremal)
     error = float(jnp.max(segment_errors(exact)))
     watch(Progress("free knots", exact, error))

@@ -21,6 +21,7 @@ from jaxguide.problem import (
     parameters,
     with_parameters,
 )
+from jaxguide.spectral import legendre_matrix
 
 
 _APART = 1e-6  # the least distance of free knots, of the horizon
@@ -96,6 +97,7 @@ class Transcription(eqx.Module):
     family: str = eqx.field(static=True)
     points: int = eqx.field(static=True)
     held: Float[Array, "segment m"] | None = None  # -1, 1: control held at that bound
+    smooth: Float[Array, "segment m"] | None = None  # weight of the control's roughness
 
     @property
     def rule(self) -> Collocation:
@@ -193,6 +195,14 @@ class Transcription(eqx.Module):
         over = jax.vmap(jax.vmap(self.node), in_axes=(None, None, 0))
         return over(*self._taus, self.inputs(w)), self.end(self.end_inputs(w))
 
+    def roughness(self, u: Float[Array, "segment node m"]) -> Float[Array, "segment node m"]:
+        """Gradient, linear in u, of half the weighted squares of each control's upper Legendre
+        coefficients: what keeps it smooth on a singular arc, where nothing else does."""
+        if self.smooth is None:
+            return jnp.zeros_like(u)
+        upper = legendre_matrix(jnp.asarray(self.rule.nodes, u.dtype))[self.points // 2 :]
+        return jnp.einsum("sm,ij,sjm->sim", self.smooth, upper.T @ upper, u)
+
     def objective_and_residual(self, w: Primal, values: Any = None) -> tuple[Array, Rows]:
         """J of problem P and the constraints, scaled."""
         node, end = self.values(w) if values is None else values
@@ -201,7 +211,8 @@ class Transcription(eqx.Module):
         defect = jnp.einsum("rp,spn->srn", A, self.support(w))
         defect = defect - jnp.einsum("rk,skn->srn", B, node[:, :, :n])
         residual = Rows(defect, node[:, :, n + 1 :] - w.path, end[1:] - w.end)
-        return jnp.sum(node[:, :, n]) + end[0], residual
+        rough = jnp.sum(w.u * self.roughness(w.u)) / 2
+        return jnp.sum(node[:, :, n]) + end[0] + rough, residual
 
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
         """Values and Jacobians, node by node."""
