@@ -165,7 +165,7 @@ def factorise(
     T, X = segments.T, segments.X
     H = jnp.einsum("siv,siw->svw", flat(T), flat(jnp.einsum("skab,skbv->skav", W, T)))
     H = H + jnp.einsum("siv,siw->svw", flat(X), flat((system.sigma.x + delta)[..., None] * X))
-    if program.smooth is not None:
+    if program.arcwise is not None:
         of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
         H = H + jnp.einsum("skmv,skmw->svw", segments.U, of_columns(segments.U))
     stages, P, convex = _sweep(program, segments, H, rho)

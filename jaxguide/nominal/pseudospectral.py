@@ -17,6 +17,7 @@ from jaxguide.nominal.implicit import sensitivity
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
 from jaxguide.nominal.shooting import unwrap_angles
 from jaxguide.nominal.transcription import (
+    Arcwise,
     Bounds,
     Primal,
     Scale,
@@ -53,11 +54,7 @@ class Pseudospectral(eqx.Module):
       `fractions`, the break points of the horizon from 0 to 1. `knots`: which of the inner ones
       (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
       others keep their places between them. For switches, kinks and junctions.
-    - `held`: (segments, m), 1 or -1 where a control is to stay at its upper or lower bound, 0
-      elsewhere: arcs of a known structure. The sign of its multiplier tells whether it should.
-    - `smooth`: (segments, m), weights of the squares of the upper half of each control's Legendre
-      coefficients, added to the objective: for singular arcs, where nothing else keeps a control
-      from oscillating. Where the true control is smooth its share of the objective vanishes.
+    - `arcwise`: what is known of each segment's arc: controls at bounds, singular, and so on.
     - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
       (n,): delta^N of problem B^N. Zero: not at all.
     - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
@@ -78,8 +75,7 @@ class Pseudospectral(eqx.Module):
     segments: int = eqx.field(static=True, default=12)
     fractions: Any = None
     knots: tuple[int, ...] = eqx.field(static=True, default=())
-    held: Any = None
-    smooth: Any = None
+    arcwise: Arcwise | None = None
     relaxation: Any = eqx.field(static=True, default=0.0)
     time_scale: float = eqx.field(static=True, default=1.0)
     tolerance: float = eqx.field(static=True, default=1e-9)
@@ -142,6 +138,16 @@ class Pseudospectral(eqx.Module):
         delta = jnp.broadcast_to(jnp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
         return relaxed(whole, jnp.pad(delta, (0, whole.n - problem.n)))
 
+    def _arcwise(self, whole: Problem) -> Arcwise | None:
+        """`arcwise` with entries for the states and controls that `whole` has besides."""
+        known = self.arcwise
+        if known is None:
+            return None
+        more = lambda a, k: jnp.pad(a, (*((0, 0),) * (a.ndim - 1), (0, k - a.shape[-1])))
+        return Arcwise(
+            more(known.held, whole.m), more(known.smooth, whole.m), more(known.released, whole.n)
+        )
+
     def prepared(
         self, problem: Problem, guess: Any
     ) -> tuple[Transcription, Primal, interior_point.Options]:
@@ -155,10 +161,8 @@ class Pseudospectral(eqx.Module):
         unit = unit_scale(whole, len(self.knots))
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
-        wide = lambda a: jnp.pad(jnp.asarray(a, dtype), ((0, 0), (0, whole.m - np.shape(a)[1])))
-        held, smooth = (None if a is None else wide(a) for a in (self.held, self.smooth))
         program = Transcription(
-            whole, unit, edges(fractions, self.knots), family, self.nodes, held, smooth
+            whole, unit, edges(fractions, self.knots), family, self.nodes, self._arcwise(whole)
         )
         if guess is None:
             w = straight_guess(program, fractions, self.knots)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.nominal.pseudospectral import Pseudospectral
 from jaxguide.nominal.structure import Arcs, arcs
+from jaxguide.nominal.transcription import Arcwise
 from jaxguide.nominal.wrappers import Endless
 from jaxguide.problem import Problem, hamiltonian
 from jaxguide.spectral import (
@@ -112,13 +113,13 @@ def refined(
     """
     error = float(jnp.max(segment_errors(extremal)))
     watch(Progress("first mesh", extremal, error))
-    original = method
+    original, worst = method, np.inf
     for k in range(method.refinements):
         errors = np.asarray(segment_errors(extremal))
         if extremal.result != RESULTS.successful or not np.all(np.isfinite(errors)):
             break
         found = arcs(extremal)
-        if k == 1 or (k == 0 and errors.max() <= method.mesh_tolerance):
+        if k in (1, 3) or (k == 0 and errors.max() <= method.mesh_tolerance):
             exact = structured(run, original, problem, extremal, found, watch)
             if exact is not None:
                 return exact
@@ -128,12 +129,12 @@ def refined(
         fractions = _fractions(extremal)
         segments, nodes = len(fractions) - 1, method.nodes
         smooth = not len(found.junctions) and nodes < _MOST_NODES
-        if k in (0, 2) and not (smooth and resolved):
-            step = "breaks moved"
+        if errors.max() < 0.3 * worst and not (smooth and resolved):
+            step, worst = "breaks moved", errors.max()
         elif smooth:
-            step, nodes = "more nodes", min(nodes + 4, _MOST_NODES)
+            step, nodes, worst = "more nodes", min(nodes + 4, _MOST_NODES), np.inf
         elif 2 * segments <= _MOST_SEGMENTS:
-            step, segments = "more segments", 2 * segments
+            step, segments, worst = "more segments", 2 * segments, np.inf
         else:
             break
         method = _meshed(method, moved(fractions, errors, segments), nodes)
@@ -156,11 +157,10 @@ def _meshed(
     fractions: np.ndarray,
     nodes: int,
     knots: tuple = (),
-    held: Any = None,
-    smooth: Any = None,
+    arcwise: Arcwise | None = None,
 ) -> Pseudospectral:
     return Pseudospectral(
-        method.grid, nodes, len(fractions) - 1, fractions, knots, held, smooth, method.relaxation,
+        method.grid, nodes, len(fractions) - 1, fractions, knots, arcwise, method.relaxation,
         method.time_scale, method.tolerance, method.max_iterations, 0, method.mesh_tolerance,
     )  # fmt: skip
 
@@ -174,7 +174,7 @@ def structured(
     watch: Callable[[Progress], None],
 ) -> Extremal | None:
     """The extremal of the structure `found`, or None where that is not clear, or not better."""
-    m, junctions = problem.m, found.junctions
+    n, m, junctions = problem.n, problem.m, found.junctions
     switches = np.any(np.diff(found.active[:, :m], axis=0), axis=1)
     if not 0 < len(junctions) <= _MOST_JUNCTIONS or not switches.any():
         return None
@@ -183,7 +183,7 @@ def structured(
     affine = _affine(extremal)
     t0, tf = float(extremal.t[0]), float(extremal.t[-1])
     main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
-    breaks, knots, held, smooth = [0.0], [], [], []
+    breaks, knots, held, smooth, released = [0.0], [], [], [], []
     for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
         # A singular arc gets one polynomial: more would let its control chatter.
         singular = affine & (found.active[arc, :m] == 0)
@@ -191,13 +191,16 @@ def structured(
         breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
         held += [found.active[arc, :m]] * count
         smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
+        # With every control held a state bound is implied but for one point, the arc's last.
+        implied = (found.active[arc, m : m + n] != 0) & np.all(found.active[arc, :m] != 0)
+        released += [np.stack([implied, implied])] * count
+        released[-1] = np.stack([implied, np.zeros(n, bool)])
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
-    knotted = _meshed(
-        method, np.array(breaks), _KNOTTED_NODES, tuple(knots), np.array(held, float),
-        np.array(smooth) if np.any(smooth) else None,
-    )  # fmt: skip
+    known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released)))
+    known = eqx.tree_at(lambda k: k.held, known, known.held.astype(known.smooth.dtype))
+    knotted = _meshed(method, np.array(breaks), _KNOTTED_NODES, tuple(knots), known)
     exact = run(knotted, problem, extremal)
     error = float(jnp.max(segment_errors(exact)))
     watch(Progress("free knots", exact, error))

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxguide.nominal.mesh import Collocation, collocation
 from jaxguide.problem import (
@@ -87,6 +87,23 @@ class Sizes(NamedTuple):
     times: int
 
 
+class Arcwise(eqx.Module):
+    """What is known of the arc that each segment is part of.
+
+    - `held`: 1 or -1 where a control is to stay at its upper or lower bound, 0 elsewhere. The sign
+      of its multiplier tells whether it should.
+    - `smooth`: weights of the squares of the upper half of each control's Legendre coefficients,
+      added to the objective: for singular arcs, where nothing else keeps a control from
+      oscillating. Where the true control is smooth their share of the objective vanishes.
+    - `released`: states whose bounds are implied by controls held, and would only have multipliers
+      of their own choice; the last point of a segment counts by itself.
+    """
+
+    held: Float[Array, "segment m"]
+    smooth: Float[Array, "segment m"]
+    released: Bool[Array, "segment two n"]
+
+
 class Transcription(eqx.Module):
     """A Problem on S segments, `points` nodes of `family` each; their breaks are the combinations
     `edges` of the times t0, tf and free knots."""
@@ -96,8 +113,7 @@ class Transcription(eqx.Module):
     edges: Float[Array, "edge clock"]
     family: str = eqx.field(static=True)
     points: int = eqx.field(static=True)
-    held: Float[Array, "segment m"] | None = None  # -1, 1: control held at that bound
-    smooth: Float[Array, "segment m"] | None = None  # weight of the control's roughness
+    arcwise: "Arcwise | None" = None
 
     @property
     def rule(self) -> Collocation:
@@ -198,10 +214,10 @@ class Transcription(eqx.Module):
     def roughness(self, u: Float[Array, "segment node m"]) -> Float[Array, "segment node m"]:
         """Gradient, linear in u, of half the weighted squares of each control's upper Legendre
         coefficients: what keeps it smooth on a singular arc, where nothing else does."""
-        if self.smooth is None:
+        if self.arcwise is None:
             return jnp.zeros_like(u)
         upper = legendre_matrix(jnp.asarray(self.rule.nodes, u.dtype))[self.points // 2 :]
-        return jnp.einsum("sm,ij,sjm->sim", self.smooth, upper.T @ upper, u)
+        return jnp.einsum("sm,ij,sjm->sim", self.arcwise.smooth, upper.T @ upper, u)
 
     def objective_and_residual(self, w: Primal, values: Any = None) -> tuple[Array, Rows]:
         """J of problem P and the constraints, scaled."""
@@ -302,14 +318,18 @@ def bounds(program: Transcription) -> Bounds:
     apart = (jnp.full(len(program.order), _APART, dtype), jnp.full(len(program.order), jnp.inf, dtype))
 
     u = [over(b / scale.u, size.segments, size.nodes) for b in controls]
-    if program.held is not None:
-        at = program.held[:, None]
+    x = [over(b / scale.x, size.segments, size.after) for b in states]
+    if program.arcwise is not None:
+        at = program.arcwise.held[:, None]
         u = [jnp.where(at > 0, u[1], u[0]), jnp.where(at < 0, u[0], u[1])]
+        inner, last = jnp.split(program.arcwise.released, 2, axis=1)
+        free = jnp.concatenate([jnp.repeat(inner, size.after - 1, axis=1), last], axis=1)
+        x = [jnp.where(free, side, b) for side, b in zip((-jnp.inf, jnp.inf), x, strict=True)]
 
     def side(i: int) -> Primal:
         return Primal(
             x0[i] / scale.x,
-            over(states[i] / scale.x, size.segments, size.after),
+            x[i],
             u[i],
             jnp.stack([t[i] for t in times]) / scale.t,
             (jnp.stack([v[i] for v in p]) if p else jnp.zeros(0, dtype)) / scale.p,
