@@ -212,9 +212,8 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     )
     free_mask = jnp.asarray(free)
     rows.add("initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], tight)
-    # A bound met at the very end has a covector of its own there.
-    last = extremal.multipliers.state[-1] * half[-1] * 2 * legendre_matrix(extremal.reference_nodes)[0, -1]
-    gap = (costate[-1] - last - g[1]) / lam_span
+    # A bound met at the very end may have a covector of its own there.
+    gap = _slackness((costate[-1] - g[1]) / lam_span, xf, problem.state_bounds)
     rows.add("transversality, end", costates, gap[None], tf[None], tight)
     if any(free):
         gap = jnp.where(free_mask, costate[0] + g[0], 0.0) / lam_span
@@ -232,6 +231,11 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
             "H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], tight
         )
     h_t = over(jax.grad(constrained_hamiltonian, argnums=1))(times, gx, gu, glam, gheld)
+    if extremal.costate_before is not None:
+        # At a break the costate may jump, by a covector of a bound that is met there.
+        jumps = (extremal.costate_before[:-1] - costate[step:-1:step]) / lam_span
+        held_there = jax.vmap(_slackness, in_axes=(0, 0, None))(jumps, x[step:-1:step], problem.state_bounds)
+        rows.add("costate jumps", costates, held_there, breaks[1:-1], tight)
     drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
     gap = (h_node[step::step] - h_node[0] - drift) / h_scale
     rows.add("Hamiltonian rate", ("H",), gap[:, None], breaks[1:], tight)
@@ -298,17 +302,21 @@ def _complementarity(extremal: Extremal) -> Float[Array, "node constraint"]:
     with the right sign, or let go."""
     problem, m = extremal.problem, extremal.multipliers
     h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
-    sides = []
-    for values, bounds, multiplier in (
-        (h, problem.path_bounds, m.path),
-        (extremal.x, problem.state_bounds, m.state),
-        (extremal.u, problem.control_bounds, m.control),
-    ):
-        lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
-        distance = jnp.where(multiplier > 0, hi[None] - values, values - lo[None])
-        # Beyond a size of one, as for a bound at infinity, the multiplier alone counts.
-        sides.append(jnp.abs(multiplier) * jnp.clip(distance, 0.0, 1.0))
+    over = jax.vmap(_slackness, in_axes=(0, 0, None))
+    sides = (
+        over(m.path, h, problem.path_bounds),
+        over(m.state, extremal.x, problem.state_bounds),
+        over(m.control, extremal.u, problem.control_bounds),
+    )
     return jnp.concatenate(sides, axis=1)
+
+
+def _slackness(multiplier: Float[Array, " k"], values: Float[Array, " k"], bounds: Any) -> Array:
+    """|multiplier| times the distance from the bound that its sign names."""
+    lo, hi = bounds_of(bounds, values.shape[0], values.dtype)
+    distance = jnp.where(multiplier > 0, hi - values, values - lo)
+    # Beyond a size of one, as for a bound at infinity, the multiplier alone counts.
+    return jnp.abs(multiplier) * jnp.clip(distance, 0.0, 1.0)
 
 
 def _cost_scale(extremal: Extremal) -> Array:

@@ -402,7 +402,7 @@ def to_extremal(
     whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
     t_support = node_times(program, w, rule.support)
     t = jnp.concatenate([t_support[:, :-1].reshape(-1), t_support[-1, -1:]])
-    lam, before = costates(program, solution)
+    lam, before, impulse = costates(program, box, solution)
     nodes, ends = program.derivatives(w)
     left = kkt.gradient(program, nodes, ends, w, solution.y).u
     net_u = jnp.where(box.lo.u >= box.hi.u, -left, solution.zu.u - solution.zl.u)
@@ -428,12 +428,13 @@ def to_extremal(
     ahead = lambda a: jnp.concatenate([a[0, :1], jnp.concatenate(a[:, 1:])])
     owned = ahead if rule.first else whole
     over_nodes = lambda a: owned(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
-    # Multipliers of state bounds live at the support points; one that is no node has no weight of
-    # its own, and takes the least.
+    # Multipliers of state bounds live at the support points. At a segment's end a part of them may
+    # be an impulse, by which the costate jumps; where that is no node, all.
     own = slice(rule.first, rule.first + size.nodes)
-    weights = np.full(len(rule.support), rule.w.min())
+    weights = np.full(len(rule.support), np.inf)
     weights[own] = rule.w
-    net = jnp.pad(solution.zu.x - solution.zl.x, ((0, 0), (1, 0), (0, 0)))
+    net = solution.zu.x - solution.zl.x
+    net = jnp.pad(net.at[:, -1].add(-impulse), ((0, 0), (1, 0), (0, 0)))
     state = ahead(net / (jnp.asarray(weights, dtype)[None, :, None] * clock))
     state = state * (scale.objective / scale.x)[None]
     status = solution.status
@@ -472,9 +473,10 @@ def to_extremal(
 
 
 def costates(
-    program: Transcription, solution: interior_point.Solution
-) -> tuple[Float[Array, "segment support n"], Float[Array, "segment n"]]:
-    """Scaled costates at the support points, and just before the end of each segment.
+    program: Transcription, box: Bounds, solution: interior_point.Solution
+) -> tuple[Float[Array, "segment support n"], Float[Array, "segment n"], Float[Array, "segment n"]]:
+    """Scaled costates at the support points and just before the end of each segment, and their
+    jumps there.
 
     With the defect multipliers y of the Lagrangian f + y^T (A X - B F), lambda = -B^T y/w at the
     nodes (Remark 3). At a segment's start the costate is what the segment's Lagrangian gives for
@@ -501,6 +503,10 @@ def costates(
         v = jnp.asarray(left_null(program.family, program.points), dtype) / weights
         gamma = ((nodal[:, 0] - start) / v[0] + (nodal[:, -1] - before) / v[-1]) / 2
         nodal = nodal - v[None, :, None] * gamma[:, None]
+    if rule.first + C == len(rule.support):
+        # On a bound the costate before is what its own polynomial says; else it is continuous.
+        room = jnp.minimum(w.x[:, -1] - box.lo.x[:, -1], box.hi.x[:, -1] - w.x[:, -1])
+        before = jnp.where(room < 1e-6, nodal[:, -1], after)
     lam = jnp.zeros((size.segments, size.after + 1, n), dtype)
     lam = lam.at[:, own].set(nodal).at[:, 0].set(start).at[:, -1].set(before)
-    return lam, before
+    return lam, before, before - after

@@ -193,6 +193,8 @@ def structured(
         smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
         # With every control held a state bound is implied but for one point, the arc's last.
         implied = (found.active[arc, m : m + n] != 0) & np.all(found.active[arc, :m] != 0)
+        if released:
+            released[-1] = released[-1] | np.stack([np.zeros(n, bool), implied])
         released += [np.stack([implied, implied])] * count
         released[-1] = np.stack([implied, np.zeros(n, bool)])
         if arc < len(switches) and switches[arc]:

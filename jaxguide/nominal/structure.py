@@ -40,7 +40,7 @@ def arcs(extremal: Extremal) -> Arcs:
         ("path ", tuple(map(str, range(h.shape[1]))), h, problem.path_bounds),
     ):
         lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
-        span = np.where(np.isfinite(hi - lo), hi - lo, np.ptp(values, axis=0) + 1e-12)
+        span = np.minimum(hi - lo, np.ptp(values, axis=0) + 1e-12)
         at = np.where(values - lo <= _NEAR * span, -1, 0) + np.where(
             hi - values <= _NEAR * span, 1, 0
         )
@@ -60,6 +60,7 @@ def _by_segment(extremal: Extremal):
 
 def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
     """Runs of equal labels; short ones are shared out between their neighbours."""
+    labels = np.stack([_calmed(column) for column in labels.T], axis=1)
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.any(np.diff(labels, axis=0), axis=1))])
     ends = np.append(starts[1:], len(t))
     long = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= _LEAST]
@@ -72,3 +73,13 @@ def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
     junctions = [(t[b - 1] + t[a]) / 2 for (_, b), (a, _) in zip(merged, merged[1:], strict=False)]
     active = [labels[a] for a, _ in merged]
     return Arcs(np.array(junctions), np.array(active), names)
+
+
+def _calmed(labels: np.ndarray) -> np.ndarray:
+    """One component's labels, runs of less than `_LEAST` nodes joined to what came before."""
+    starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(labels)), [len(labels)]])
+    out = labels.copy()
+    for a, b in zip(starts[1:-1], starts[2:], strict=True):
+        if b - a < _LEAST:
+            out[a:b] = out[a - 1]
+    return out
