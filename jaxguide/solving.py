@@ -6,10 +6,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.certificate import certifier
+from jaxguide.nominal.diagnosis import why
 from jaxguide.nominal.pseudospectral import Pseudospectral, finished
 from jaxguide.nominal.refinement import refined
 from jaxguide.nominal.shooting import Shooting
@@ -130,23 +130,5 @@ def _quick(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def raise_if_failed(extremal: Extremal) -> None:
     """Raises `SolveError` unless `extremal.result` is success, naming the worst miss. Host only."""
-    if bool(extremal.result == RESULTS.successful):
-        return
-    problem = extremal.problem
-    message = [f"{type(problem).__name__}: {RESULTS[extremal.result]}"]
-    e = np.asarray(
-        problem.endpoint_constraints(extremal.x[0], extremal.x[-1], extremal.t[0], extremal.t[-1])
-    )
-    lo, hi = (np.broadcast_to(np.asarray(b, float), e.shape) for b in problem.endpoint_bounds)
-    miss = np.maximum(lo - e, 0) + np.maximum(e - hi, 0)
-    if not np.all(np.isfinite(np.asarray(extremal.x))):
-        message.append("The last iterate left finite numbers.")
-    elif miss.size and miss.max() > 1e-8:
-        i = int(np.argmax(miss))
-        message.append(
-            f"Endpoint constraint {i} misses its bounds by {miss[i]:.3g} "
-            f"(value {e[i]:.6g}, bounds [{lo[i]:g}, {hi[i]:g}]); if it contradicts another or lies "
-            "out of reach, relax it."
-        )
-    message.append(f"Boundary residual {float(jnp.asarray(extremal.residual)):.2e}.")
-    raise SolveError(" ".join(message))
+    if not bool(extremal.result == RESULTS.successful):
+        raise SolveError(why(extremal))

@@ -3,6 +3,8 @@
 **Source:** Ross & Karpenko, review (2012), sections 3 and 4.
 """
 
+import math
+import os
 from typing import Any
 
 import equinox as eqx
@@ -124,7 +126,28 @@ class Pseudospectral(eqx.Module):
         """Nothing that a Problem may hold is beyond it. Host only."""
 
     def check(self, problem: Problem) -> None:
-        """Nothing that a Problem may ask is beyond it. Host only."""
+        """Refuses a mesh that memory will not hold. Host only.
+
+        **Raises:** `ValueError` with the estimate.
+        """
+        need, have = self.memory(problem), _physical_memory()
+        if need > have:
+            segments = self.segments if self.fractions is None else len(self.fractions) - 1
+            raise ValueError(
+                f"Pseudospectral: {segments} segments of {self.nodes} nodes with {problem.n} states "
+                f"and {problem.m} controls need some {need / 1e9:.3g} GB of the {have / 1e9:.3g} GB "
+                "here; use fewer nodes and more segments."
+            )
+
+    def memory(self, problem: Problem) -> float:
+        """Bytes of a Newton step, roughly: a segment's orthonormal basis, the directions that its
+        nodes' inputs take, and a few copies."""
+        segments = self.segments if self.fractions is None else len(self.fractions) - 1
+        n, m, C = problem.n, problem.m, float(self.nodes)
+        basis = (C + 1) * n + C * m
+        directions = 2 * n + C * m + 2
+        entries = 2 * basis**2 + 4 * basis * directions + directions**2
+        return 8 * segments * (3 * entries + C * (n + m + 2) ** 2 * 4)
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
@@ -197,6 +220,13 @@ def finished(
     solution = _solved(whole, program, start, options)
     program = eqx.tree_at(lambda p: p.problem, program, whole)
     return to_extremal(problem, program, bounds(program), solution, certifier)
+
+
+def _physical_memory() -> float:
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):  # where the system does not say
+        return math.inf
 
 
 def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
