@@ -35,7 +35,8 @@ def solve(
     - `method`: `jg.Shooting` or `jg.Pseudospectral`. Default: shooting, the more accurate, unless
       the Problem has bounds, path constraints or what else shooting cannot do. Where its bounds
       are traced that cannot be seen: name the method, or look for `bounds_violated`.
-    - `guess`: None, an Extremal of a similar problem, or initial costates (n,).
+    - `guess`: None, an Extremal of a similar problem, initial costates (n,) for shooting, or a
+      `jax.random.key` for a random start of a direct solve.
     - `watch`: called after each solve of a direct method's refinement with what it is and how
       good, such as `print`. Not under a trace.
     - `throw`: raise if it fails. Under a trace nothing is raised; look at `.result`.
@@ -59,7 +60,7 @@ def solve(
     if is_traced((problem, guess)):
         extremal = method(problem, guess, certifier(method.accuracy))
         return opened(extremal) if without_end else extremal
-    extremal = _run(method, problem, guess)
+    extremal = _best(method, problem, guess) if direct else _run(method, problem, guess)
     if direct and method.refinements:
         extremal = refined(_run, method, problem, extremal, watch or (lambda _: None))
     if without_end:
@@ -104,6 +105,17 @@ def quick_compilation() -> dict[str, bool]:
     except Exception:  # whatever the backend says of options it does not know
         return {}
     return options
+
+
+def _best(method: Pseudospectral, problem: Problem, guess: Any) -> Extremal:
+    """From `guess` and from random starts, the least objective that converged."""
+    best = _run(method, problem, guess)
+    for k in range(1, method.starts):
+        other = _run(method, problem, jax.random.fold_in(jax.random.key(method.seed), k))
+        good, better = (bool(e.result == RESULTS.successful) for e in (best, other))
+        if better and not (good and float(best.objective) <= float(other.objective)):
+            best = other
+    return best
 
 
 def _run(method: Any, problem: Problem, guess: Any) -> Extremal:

@@ -45,6 +45,9 @@ from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS, is_traced
 
 
+_MOST_NODES = 512
+
+
 class Pseudospectral(eqx.Module):
     """Direct collocation on one or many segments, solved by the interior-point method.
 
@@ -62,6 +65,8 @@ class Pseudospectral(eqx.Module):
     - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
       Radau nodes that leave out s = 1, where the state vanishes unless the Problem has endpoint
       constraints of its own.
+    - `starts`, `seed`: how many guesses to solve from, the first straight and the others random,
+      for the best of what they find. Under a trace: one.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
     - `refinements`: how often `solve` may move or double the mesh until each segment's defect
       between the nodes, relative to the state's span, is below `mesh_tolerance`. Under a trace
@@ -80,6 +85,8 @@ class Pseudospectral(eqx.Module):
     arcwise: Arcwise | None = None
     relaxation: Any = eqx.field(static=True, default=0.0)
     time_scale: float = eqx.field(static=True, default=1.0)
+    starts: int = eqx.field(static=True, default=1)
+    seed: int = eqx.field(static=True, default=0)
     tolerance: float = eqx.field(static=True, default=1e-9)
     max_iterations: int = eqx.field(static=True, default=500)
     refinements: int = eqx.field(static=True, default=8)
@@ -95,6 +102,13 @@ class Pseudospectral(eqx.Module):
             raise ValueError(f"Pseudospectral: segments is {self.segments}; give at least 1.")
         if self.max_iterations < 1:
             raise ValueError(f"Pseudospectral: max_iterations is {self.max_iterations}.")
+        if self.starts < 1:
+            raise ValueError(f"Pseudospectral: starts is {self.starts}; give at least 1.")
+        if self.nodes > _MOST_NODES:
+            raise ValueError(
+                f"Pseudospectral: nodes is {self.nodes}; at most {_MOST_NODES} a segment, where the "
+                "interpolation still keeps its digits: use more segments."
+            )
         if self.refinements < 0:
             raise ValueError(f"Pseudospectral: refinements is {self.refinements}; need at least 0.")
         for name in ("tolerance", "mesh_tolerance"):
@@ -189,12 +203,14 @@ class Pseudospectral(eqx.Module):
         )
         if guess is None:
             w = straight_guess(program, fractions, self.knots)
+        elif is_key(guess):
+            w = random_guess(program, fractions, self.knots, guess)
         elif isinstance(guess, Extremal):
             w = from_extremal(program, fractions, self.knots, problem, guess)
         else:
             raise ValueError(
                 f"guess is a {type(guess).__name__}; jg.Pseudospectral takes an Extremal (costates "
-                "are for jg.Shooting), or None."
+                "are for jg.Shooting), a random key, or None."
             )
         scale = designer_units(program, w)
         program = eqx.tree_at(lambda p: p.scale, program, scale)
@@ -202,7 +218,7 @@ class Pseudospectral(eqx.Module):
         node, end = program.values(w)
         w = w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
         # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
-        mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
+        mu, push = (1e-3, 1e-3) if isinstance(guess, Extremal) else (0.1, 1e-2)
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
         return *jax.lax.stop_gradient((program, w)), jax.tree_util.tree_map(jnp.asarray, options)
 
@@ -332,6 +348,43 @@ def straight_guess(
     p = [start_value(v) for v in parameters(program.problem)]
     times = placed(t0, tf, fractions, knots)
     return without_slacks(program, x0, x, u, times, p)
+
+
+def is_key(guess: Any) -> bool:
+    """Whether `guess` is a random key: a random start."""
+    return isinstance(guess, jax.Array) and jnp.issubdtype(guess.dtype, jax.dtypes.prng_key)
+
+
+def random_guess(
+    program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...], key: Array
+) -> Primal:
+    """The straight guess, bent at random: states by two sine waves of a third of their size within
+    their bounds, controls on a line between two points of theirs, a free final time within a factor
+    of two. In user units."""
+    w = straight_guess(program, fractions, knots)
+    size, dtype, rule = program.sizes, program.dtype, program.rule
+    k_x, k_u, k_t = jax.random.split(key, 3)
+    lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
+    scale = typical(lo, hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
+    waves = jax.random.normal(k_x, (2, size.n), dtype) * scale[None] / 3
+    s = fractions_at(fractions, rule.support[1:])
+    bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
+    x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])
+    u_lo, u_hi = bounds_of(program.problem.control_bounds, size.m, dtype)
+    bounded = jnp.isfinite(u_lo) & jnp.isfinite(u_hi)
+    middle = jnp.where(bounded, (u_lo + u_hi) / 2, 0.0)
+    half = jnp.where(bounded, (u_hi - u_lo) / 2, 3.0)
+    ends = middle[None] + half[None] * jax.random.uniform(k_u, (2, size.m), dtype, -1.0, 1.0)
+    ends = jnp.clip(ends, u_lo[None], u_hi[None])
+    s = fractions_at(fractions, rule.nodes)[..., None]
+    u = ends[0][None, None] * (1 - s) + ends[1][None, None] * s
+    tf = program.problem.final_time
+    times = w.times
+    if is_free(tf):
+        span = (times[1] - times[0]) * 2 ** jax.random.uniform(k_t, (), dtype, -1.0, 1.0)
+        end = jnp.clip(times[0] + span, jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype))
+        times = placed(times[0], end, fractions, knots)
+    return w._replace(x=x, u=u, times=times)
 
 
 def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Float[Array, " k"]:

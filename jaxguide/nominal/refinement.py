@@ -162,7 +162,7 @@ def _meshed(
 ) -> Pseudospectral:
     return Pseudospectral(
         method.grid, nodes, len(fractions) - 1, fractions, knots, arcwise, method.relaxation,
-        method.time_scale, method.tolerance, method.max_iterations, 0, method.mesh_tolerance,
+        method.time_scale, 1, method.seed, method.tolerance, method.max_iterations, 0, method.mesh_tolerance,
     )  # fmt: skip
 
 
