@@ -68,9 +68,10 @@ class Pseudospectral(eqx.Module):
     - `starts`, `seed`: how many guesses to solve from, the first straight and the others random,
       for the best of what they find. Under a trace: one.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
-    - `refinements`: how often `solve` may move or double the mesh until each segment's defect
-      between the nodes, relative to the state's span, is below `mesh_tolerance`. Under a trace
-      the mesh stays.
+    - `refinements`: how often `solve` may raise the number of nodes or segments (it also moves
+      breaks, and frees the junctions of a clear structure) until each segment's defect between the
+      nodes, relative to the state's span, is below `mesh_tolerance`. Zero: one solve. Under a
+      trace the mesh stays.
 
     **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
 
@@ -89,7 +90,7 @@ class Pseudospectral(eqx.Module):
     seed: int = eqx.field(static=True, default=0)
     tolerance: float = eqx.field(static=True, default=1e-9)
     max_iterations: int = eqx.field(static=True, default=500)
-    refinements: int = eqx.field(static=True, default=8)
+    refinements: int = eqx.field(static=True, default=4)
     mesh_tolerance: float = eqx.field(static=True, default=1e-7)
     accuracy = 1e-6  # that its certificates ask for
 

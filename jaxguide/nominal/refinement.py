@@ -31,6 +31,7 @@ from jaxguide.types import RESULTS
 # first choices, tried on five problems of the library and not tuned.
 _POWER, _FLOOR = 1 / 3, 0.03
 _MOST_NODES, _MOST_SEGMENTS = 14, 96
+_MOST_MOVES = 6  # of the breaks of one size of mesh
 _MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise
 _SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
 _WRONG = 1e-2  # complementarity of a structure, relative to H, beyond which it is not believed
@@ -114,37 +115,45 @@ def refined(
     """
     error = float(jnp.max(segment_errors(extremal)))
     watch(Progress("first mesh", extremal, error))
-    original, worst = method, np.inf
-    for k in range(method.refinements):
+    original, worst, moves, raised, tried = method, np.inf, 0, 0, -1
+    while raised <= method.refinements:
         errors = np.asarray(segment_errors(extremal))
         if extremal.result != RESULTS.successful or not np.all(np.isfinite(errors)):
             break
         found = arcs(extremal)
-        if k in (1, 3) or (k == 0 and errors.max() <= method.mesh_tolerance):
+        resolved = errors.max() <= method.mesh_tolerance
+        smooth = not len(found.junctions) and method.nodes < _MOST_NODES
+        # Moving breaks costs no compilation: for as long as it helps.
+        move = not (smooth and resolved) and moves < _MOST_MOVES and errors.max() < 0.5 * worst
+        if (moves or resolved) and not (move and moves < 2) and tried < min(raised, 1):
+            tried = raised
             exact = structured(run, original, problem, extremal, found, watch)
             if exact is not None:
                 return exact
-        resolved = errors.max() <= method.mesh_tolerance
         if resolved and (len(found.junctions) or float(tails(extremal)) <= method.mesh_tolerance):
             break
         fractions = _fractions(extremal)
         segments, nodes = len(fractions) - 1, method.nodes
-        smooth = not len(found.junctions) and nodes < _MOST_NODES
-        if errors.max() < 0.3 * worst and not (smooth and resolved):
-            step, worst = "breaks moved", errors.max()
-        elif smooth:
-            step, nodes, worst = "more nodes", min(nodes + 4, _MOST_NODES), np.inf
-        elif 2 * segments <= _MOST_SEGMENTS:
-            step, segments, worst = "more segments", 2 * segments, np.inf
+        if move:
+            step, worst, moves = "breaks moved", errors.max(), moves + 1
         else:
-            break
+            worst, moves, raised = np.inf, 0, raised + 1
+            if smooth:
+                step, nodes = "more nodes", min(nodes + 4, _MOST_NODES)
+            elif 2 * segments <= _MOST_SEGMENTS:
+                step, segments = "more segments", 2 * segments
+            else:
+                break
+            if raised > method.refinements:
+                break
         method = _meshed(method, moved(fractions, errors, segments), nodes)
         better = run(method, problem, extremal)
         error = float(jnp.max(segment_errors(better)))
         watch(Progress(step, better, error))
         if better.result != RESULTS.successful:
             break
-        extremal = better
+        if error < errors.max() or step != "breaks moved":
+            extremal = better
     return extremal
 
 
@@ -162,7 +171,8 @@ def _meshed(
 ) -> Pseudospectral:
     return Pseudospectral(
         method.grid, nodes, len(fractions) - 1, fractions, knots, arcwise, method.relaxation,
-        method.time_scale, 1, method.seed, method.tolerance, method.max_iterations, 0, method.mesh_tolerance,
+        method.time_scale, 1, method.seed, method.tolerance, method.max_iterations, method.refinements,
+        method.mesh_tolerance,
     )  # fmt: skip
 
 

@@ -11,7 +11,9 @@ from jaxguide.spectral import legendre_matrix
 from jaxguide.trajectory import Extremal
 
 _NEAR = 1e-4  # of a constraint's range: as near as this it is active
-_LEAST = 2  # nodes an arc holds; what is shorter is the blur of a junction
+# What an arc holds at least, else it is the blur of a junction: nodes, and either more of them or a
+# share of the horizon.
+_LEAST, _MANY, _SHARE = 2, 12, 2e-3
 
 
 class Arcs(NamedTuple):
@@ -60,10 +62,10 @@ def _by_segment(extremal: Extremal):
 
 def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
     """Runs of equal labels; short ones are shared out between their neighbours."""
-    labels = np.stack([_calmed(column) for column in labels.T], axis=1)
+    labels = np.stack([_calmed(t, column) for column in labels.T], axis=1)
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.any(np.diff(labels, axis=0), axis=1))])
     ends = np.append(starts[1:], len(t))
-    long = [(a, b) for a, b in zip(starts, ends, strict=True) if b - a >= _LEAST]
+    long = [(a, b) for a, b in zip(starts, ends, strict=True) if _lasts(t, a, b)]
     merged: list[tuple[int, int]] = []
     for a, b in long:
         if merged and np.array_equal(labels[merged[-1][0]], labels[a]):
@@ -75,11 +77,17 @@ def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
     return Arcs(np.array(junctions), np.array(active), names)
 
 
-def _calmed(labels: np.ndarray) -> np.ndarray:
-    """One component's labels, runs of less than `_LEAST` nodes joined to what came before."""
+def _lasts(t: np.ndarray, a: int, b: int) -> bool:
+    """Whether nodes a ... b - 1 are an arc."""
+    long = t[b - 1] - t[a] >= _SHARE * (t[-1] - t[0])
+    return b - a >= _MANY or (b - a >= _LEAST and bool(long))
+
+
+def _calmed(t: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """One component's labels, runs that are no arcs joined to what came before."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(labels)), [len(labels)]])
     out = labels.copy()
     for a, b in zip(starts[1:-1], starts[2:], strict=True):
-        if b - a < _LEAST:
+        if not _lasts(t, a, b):
             out[a:b] = out[a - 1]
     return out
