@@ -15,6 +15,7 @@ from jaxguide.nominal import kkt
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
 from jaxguide.nominal.pseudospectral import edges
 from jaxguide.nominal.refinement import moved
+from jaxguide.nominal.structure import _cut
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
 from jaxguide.problems import EarthMars
 
@@ -241,12 +242,6 @@ def test_bad_options(options, words):
         jg.Pseudospectral(**options)
 
 
-def test_infinite_horizon_is_refused():
-    problem = dataclasses.replace(problems.get("scalar-regulator"), final_time=np.inf)
-    with pytest.raises(ValueError, match="final_time is infinite"):
-        jg.solve(problem, jg.Pseudospectral())
-
-
 def test_moved_mesh_goes_where_the_error_is():
     fractions, errors = np.linspace(0, 1, 11), np.full(10, 1e-9)
     errors[3] = 1e-2
@@ -269,3 +264,151 @@ KINDS = {
 def test_library_from_a_straight_line(name, left):
     e = jg.solve(problems.get(name), jg.Pseudospectral(refinements=0))
     np.testing.assert_allclose(e.objective, problems.reference(name).value, rtol=left)
+
+
+class Endless(jg.Problem):
+    """x' = x + u, cost x^2 + u^2, for ever: J = 1 + sqrt 2, u = -(1 + sqrt 2) x."""
+
+    state_names = ("x",)
+    control_names = ("u",)
+    initial_state = (1.0,)
+    final_time = np.inf
+
+    def dynamics(self, t, x, u):
+        return x + u
+
+    def running_cost(self, t, x, u):
+        return x[0] ** 2 + u[0] ** 2
+
+
+def test_infinite_horizon():
+    e = jg.solve(Endless(), jg.Pseudospectral(nodes=20, segments=1, refinements=0))
+    # reference/pseudospectral.md: an error of 1e-10 with 20 nodes.
+    np.testing.assert_allclose(e.objective, 1 + np.sqrt(2), atol=2e-10)
+    assert e.t[-1] == np.inf and e.final_time == np.inf
+    t = jnp.array([0.0, 0.5, 2.0, 5.0])
+    at = e(t)
+    # Pointwise the interpolant of 20 nodes, in s, keeps some six digits.
+    np.testing.assert_allclose(at.x[:, 0], np.exp(-np.sqrt(2) * t), atol=2e-6)
+    np.testing.assert_allclose(at.costate, 2 * (1 + np.sqrt(2)) * at.x, atol=1e-5)
+    np.testing.assert_allclose(at.u, -(1 + np.sqrt(2)) * at.x, atol=1e-5)
+
+
+def test_phases():
+    """The moon lander as a fall and a burn, linked; each phase has its own extremal and clock."""
+
+    class Fall(problems.MoonLander):
+        control_bounds = (0.0, 0.0)
+        final_time = jg.Free(0.1, 3.0, 1.0)
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return jnp.zeros(0)
+
+    class Burn(problems.MoonLander):
+        initial_state = None
+        control_bounds = (3.0, 3.0)
+        final_time = jg.Free(1.0, 10.0, 3.0)
+
+    phased = jg.Phased((Fall(), Burn()))
+    e = jg.solve(phased, jg.Pseudospectral(nodes=4, segments=1, refinements=0))
+    np.testing.assert_allclose(e.objective, problems.reference("moon-lander").value, rtol=1e-9)
+    fall, burn = phased.split(e)
+    # Coast for (sqrt 68 - 4)/3, then the burn lasts 4/3 longer.
+    switch = (np.sqrt(68) - 4) / 3
+    np.testing.assert_allclose(fall.final_time, switch, rtol=1e-8)
+    np.testing.assert_allclose(burn.final_time, 2 * switch + 4 / 3, rtol=1e-8)
+    np.testing.assert_allclose(burn.x[0], fall.x[-1], atol=1e-9)
+    np.testing.assert_allclose(burn.costate[0], fall.costate[-1], atol=1e-7)
+    assert bool(burn.certificate.passed.all()), str(burn.certificate)
+
+
+def test_phases_that_do_not_join_are_refused():
+    with pytest.raises(ValueError, match="say in `links` how they join"):
+        jg.Phased((DoubleIntegrator(), EarthMars()))
+    with pytest.raises(ValueError, match="give at least two"):
+        jg.Phased((DoubleIntegrator(),))
+
+
+def test_a_jump_of_the_state_by_links():
+    # Half the way is given: from x = 0 to 1/4, then from 3/4 to 1.
+    class First(DoubleIntegrator):
+        final_time = 0.5
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return xf - jnp.array([0.25, 1.0])
+
+    class Second(DoubleIntegrator):
+        initial_state = None
+        final_time = 1.0
+
+    def jump(ends):
+        return ends[1].x0 - ends[0].xf - jnp.array([0.5, 0.0])
+
+    e = jg.solve(
+        jg.Phased((First(), Second()), jump), jg.Pseudospectral(nodes=4, segments=1, refinements=0)
+    )
+    # Both halves fly at u = +-2: x = t^2, and backwards; J = int u^2/2 dt = 2.
+    np.testing.assert_allclose(e.objective, 2.0, rtol=1e-9)
+
+
+def test_relaxed_dynamics_cost_less():
+    method = jg.Pseudospectral(nodes=5, segments=2, refinements=0, relaxation=1e-2)
+    e = jg.solve(DoubleIntegrator(), method)
+    # J(delta) = 6 - delta (int |lambda_x| + int |lambda_v|) to first order = 6 - 15 delta.
+    np.testing.assert_allclose(e.objective, 6 - 15e-2, atol=15e-2 * 0.05)
+    assert e.u.shape[1] == 1
+
+
+def test_structure_is_found_and_solved_exactly():
+    steps = []
+    e = jg.solve(problems.get("moon-lander"), jg.Pseudospectral(), watch=steps.append)
+    assert [s.step for s in steps][-1] == "free knots", list(map(str, steps))
+    np.testing.assert_allclose(e.objective, problems.reference("moon-lander").value, rtol=1e-13)
+    assert bool(e.certificate.passed.all()), str(e.certificate)
+
+
+def test_arcs_of_labels():
+    t = np.linspace(0, 1, 40)
+    labels = np.where(t < 0.3, -1, 1)[:, None]
+    labels[20] = 0  # the blur of a node
+    found = _cut(t, labels, ("u",))
+    assert found.active.ravel().tolist() == [-1, 1]
+    np.testing.assert_allclose(found.junctions, 0.3, atol=1 / 39)
+
+
+def test_random_starts_are_extremals_or_reasons():
+    method = jg.Pseudospectral(nodes=5, segments=4, refinements=0)
+    problem = problems.get("brachistochrone")
+    found = [
+        jg.solve(problem, method, guess=jax.random.key(k), throw=False).objective for k in range(4)
+    ]
+    best = jg.solve(problem, dataclasses.replace(method, starts=4))
+    assert float(best.objective) <= min(map(float, found)) + 1e-9
+
+
+class Undefined(DoubleIntegrator):
+    initial_state = (0.5, 0.0)
+
+    def dynamics(self, t, x, u):
+        return jnp.stack([x[1], u[0] + 0.1 * jnp.log(0.7 - x[0])])
+
+
+def test_failures_name_what_is_wrong():
+    method = jg.Pseudospectral(nodes=4, segments=2)
+    with pytest.raises(jg.SolveError, match=r"d\(v\)/dt is nan at node \d+ \(t = .*mend"):
+        jg.solve(Undefined(), method)
+    short = dataclasses.replace(DoubleIntegrator(), control_bounds=(-1.0, 1.0))
+    with pytest.raises(jg.SolveError, match=r"Endpoint constraint 0 misses its bounds by 0\.\d+"):
+        jg.solve(short, method)
+    with pytest.raises(ValueError, match=r"need some .* GB of the"):
+        jg.solve(DoubleIntegrator(), jg.Pseudospectral(nodes=500, segments=100_000))
+
+
+def test_discontinuous_dynamics_fail_the_certificate():
+    class Torn(DoubleIntegrator):
+        def dynamics(self, t, x, u):
+            return jnp.stack([x[1], u[0] - jnp.where(x[0] > 0.437, 3.0, 0.0)])
+
+    e = jg.solve(Torn(), jg.Pseudospectral(nodes=4, segments=2, refinements=0), throw=False)
+    rows = {row["check"]: row["passed"] for row in e.certificate.rows()}
+    assert not rows["state equation"]

@@ -1,6 +1,6 @@
 """The arcs of an extremal: where bounds and constraints become active or let go. Host only."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -77,7 +77,7 @@ def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
     return Arcs(np.array(junctions), np.array(active), names)
 
 
-def _lasts(t: np.ndarray, a: int, b: int) -> bool:
+def _lasts(t: np.ndarray, a: Any, b: Any) -> bool:
     """Whether nodes a ... b - 1 are an arc."""
     long = t[b - 1] - t[a] >= _SHARE * (t[-1] - t[0])
     return b - a >= _MANY or (b - a >= _LEAST and bool(long))
