@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxguide.linalg import single_threaded_lapack
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal import interior_point
 from jaxguide.nominal.implicit import sensitivity
@@ -125,6 +126,7 @@ class Pseudospectral(eqx.Module):
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
         """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
+        single_threaded_lapack()
         program, start = jax.lax.stop_gradient(self.prepared(problem, guess))
         # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
         mu, push = (0.1, 1e-2) if guess is None else (1e-3, 1e-3)
