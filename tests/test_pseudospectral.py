@@ -70,7 +70,9 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
         1 + r(segments, points, 1), times + r(len(times)), jnp.array([1.4]),
         r(segments, points, 2), r(len(ends)),
     )  # fmt: skip
-    y = Rows(10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(len(ends)))
+    y = Rows(
+        10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(len(ends))
+    )
     sigma, pull = jax.tree_util.tree_map(lambda a: jnp.abs(a) + 0.3, random(w)), random(w)
     no = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, bool), w)
     given = no._replace(
@@ -269,3 +271,9 @@ KINDS = {
 def test_library_from_a_straight_line(name, left):
     e = jg.solve(problems.get(name), jg.Pseudospectral(refinements=0))
     np.testing.assert_allclose(e.objective, problems.reference(name).value, rtol=left)
+
+
+def test_npsat1_on_one_segment():
+    # reference/pseudospectral.md: CasADi + IPOPT, N = 40, from any guess.
+    e = jg.solve(problems.get("npsat1"), jg.Pseudospectral("lgl", 41, 1, refinements=0))
+    np.testing.assert_allclose(e.objective, 112.2088, atol=5e-5)

@@ -1,9 +1,10 @@
 """One Newton step of a transcription: its KKT system solved by elimination, segment by segment.
 
 Within a segment the defects leave a null space of start, clock and as many free directions as there
-are controls: one QR of their Jacobian. What is left, a quadratic in these, is minimised over the
-free directions from the last segment to the first (a Riccati sweep), carrying the global unknowns,
-the final state and its multiplier as parameters. A small dense system of the globals ends it.
+are controls: one LU factorisation of their transposed Jacobian. What is left, a quadratic in these,
+is minimised over the free directions from the last segment to the first (a Riccati sweep), carrying
+the global unknowns, the final state and its multiplier as parameters. A small dense system of the
+globals ends it.
 
 The inertia of the whole is right, so that the step descends, if every Cholesky factorisation exists
 and the last system has as many negative eigenvalues as multipliers (Haynsworth).
@@ -50,7 +51,7 @@ class Step(NamedTuple):
 
 class Segments(NamedTuple):
     """States and controls after each segment's start, linear in v = (start, z, clock, parameters),
-    where z spans what the defects leave free: scaled by `size`, an orthonormal basis."""
+    where z are the entries that the defects leave free, scaled by `size`."""
 
     basis: Float[Array, "segment row row"]  # L and U of the basic entries
     order: Int[Array, "segment xu"]  # the basic entries first
@@ -96,8 +97,9 @@ def over_segments(f: Any, items: Any) -> Any:
 
 
 def eliminate(program: Transcription, system: System) -> Segments:
-    """The defects' null space, by QR: stable however unstable the dynamics are, where following
-    the states from their start would not be."""
+    """The defects' null space, by LU: stable however unstable the dynamics are, where following
+    the states from their start would not be: of states and controls alike, pivoting makes those
+    basic that the defects determine best."""
     rule, size = program.rule, program.sizes
     n, m, C, S, dtype = size.n, size.m, size.nodes, size.segments, system.sigma.x.dtype
     A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
@@ -275,7 +277,10 @@ def apply(
     # What the states are with all of v at zero, and the forces that this and the load leave.
     by_segment = lambda a: a.reshape(S, -1)
     xu = lambda x, u: jnp.concatenate([by_segment(x), by_segment(u)], axis=1)
-    apart = lambda a: (a[:, : size.after * n].reshape(S, -1, n), a[:, size.after * n :].reshape(S, C, m))
+    apart = lambda a: (
+        a[:, : size.after * n].reshape(S, -1, n),
+        a[:, size.after * n :].reshape(S, C, m),
+    )
 
     def particular(item: tuple) -> Array:
         basis, _, place, weight, c = item

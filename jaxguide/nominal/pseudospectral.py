@@ -26,7 +26,7 @@ from jaxguide.nominal.transcription import (
     constraint_counts,
     node_times,
 )
-from jaxguide.nominal.wrappers import Endless, count, relaxed, with_integrals
+from jaxguide.nominal.wrappers import Endless, relaxed, with_integrals
 from jaxguide.problem import (
     Problem,
     bounds_of,

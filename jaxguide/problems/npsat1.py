@@ -44,15 +44,14 @@ class NPSAT1(Problem):
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         q1, q2, q3, q4, w1, w2, w3 = (x[i] for i in range(7))
         I1, I2, I3 = (jnp.asarray(self.inertia)[i] for i in range(3))
-        attitude = jnp.stack(
-            [
-                jnp.stack([q1 * q1 - q2 * q2 - q3 * q3 + q4 * q4, 2 * (q1 * q2 + q3 * q4), 2 * (q1 * q3 - q2 * q4)]),
-                jnp.stack([2 * (q1 * q2 - q3 * q4), q2 * q2 - q1 * q1 - q3 * q3 + q4 * q4, 2 * (q2 * q3 + q1 * q4)]),
-                jnp.stack([2 * (q1 * q3 + q2 * q4), 2 * (q2 * q3 - q1 * q4), q3 * q3 - q1 * q1 - q2 * q2 + q4 * q4]),
-            ]
-        )  # fmt: skip
-        B = attitude @ jnp.asarray(self.field)  # body frame
-        C13, C23 = attitude[0, 2], attitude[1, 2]
+        # The local frame's axes seen from the body: columns of the direction cosine matrix.
+        s1, s2, s3, s4 = q1 * q1, q2 * q2, q3 * q3, q4 * q4
+        C13, C23 = 2 * (q1 * q3 - q2 * q4), 2 * (q2 * q3 + q1 * q4)
+        C1 = jnp.stack([s1 - s2 - s3 + s4, 2 * (q1 * q2 - q3 * q4), 2 * (q1 * q3 + q2 * q4)])
+        C2 = jnp.stack([2 * (q1 * q2 + q3 * q4), s2 - s1 - s3 + s4, 2 * (q2 * q3 - q1 * q4)])
+        C3 = jnp.stack([C13, C23, s3 - s1 - s2 + s4])
+        B1, B2, B3 = (jnp.asarray(self.field)[i] for i in range(3))
+        B = B1 * C1 + B2 * C2 + B3 * C3
         mgl = self.weight_moment
         return jnp.stack(
             [
