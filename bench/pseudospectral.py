@@ -36,12 +36,13 @@ from jaxguide.problem import with_array_leaves  # noqa: E402
 from jaxguide.solving import quick_compilation  # noqa: E402
 
 TRUTH = 1.525277700649  # r_f of Earth-Mars
-# Earth-Mars on a fixed mesh of Radau nodes that meets 1e-9: denser where the thrust turns over.
-FINE = jg.Pseudospectral("lgr-right", 12, 8, refinements=0)
+# Earth-Mars on a fixed mesh that meets 1e-9: half of its segments where the thrust turns over.
+BREAKS = (*np.linspace(0, 0.40, 4), *np.linspace(0.40, 0.62, 7)[1:], *np.linspace(0.62, 1, 4)[1:])
+FINE = jg.Pseudospectral("lgr-right", 12, 12, fractions=BREAKS, refinements=0)
 
 
 def stated(name: str) -> tuple[Any, Any, Any, Any, float]:
-    """Our Problem as the peer states it, units of the peer's states and controls, its guess of tf."""
+    """Our Problem as the peer states it, the peer's units of state and control, its guess of tf."""
     p = problems.get(name)
     if name == "earth-mars":
         box = ((0.5, -2.0, 0.1), (3.0, 2.0, 2.0))

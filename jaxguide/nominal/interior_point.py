@@ -164,7 +164,9 @@ def _count(tree: Any) -> int:
 def complementarity(box: _Box, low: Primal, high: Primal, zl: Primal, zu: Primal) -> Array:
     """Mean of distance times multiplier over all bounds; 0 where there is none."""
     both = _tree(lambda a, b, x, y: a * x + b * y, low, high, zl, zu)
-    count = _total(_tree(lambda a, b: 1.0 * a + b, box.below, box.above))
+    count = _total(
+        _tree(lambda a, b: jnp.where(a, 1.0, 0.0) + jnp.where(b, 1.0, 0.0), box.below, box.above)
+    )
     return _total(both) / jnp.maximum(count, 1.0)
 
 
