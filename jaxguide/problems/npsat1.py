@@ -24,9 +24,9 @@ class NPSAT1(Problem):
     **Source:** Ross, Sekhavat, Fleming & Gong (2006), eqs (31)-(38), magnetic field in tesla.
     """
 
-    inertia: ArrayLike = (2.60, 2.87, 1.45)  # kg m^2
+    inertia: tuple = (2.60, 2.87, 1.45)  # kg m^2
     weight_moment: ArrayLike = 59.0 * 9.81 * 0.56e-3  # N m
-    field: ArrayLike = (0.24970e-4, 0.09993e-4, 0.39280e-4)  # T, local frame
+    field: tuple = (0.24970e-4, 0.09993e-4, 0.39280e-4)  # T, local frame
     state_names = ("q1", "q2", "q3", "q4", "omega1", "omega2", "omega3")
     control_names = ("u1", "u2", "u3")
     initial_state = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
