@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jaxguide import problems as problems
+    from jaxguide.batch import solve_batch as solve_batch
     from jaxguide.certificate import Certificate as Certificate
     from jaxguide.certificate import certify as certify
     from jaxguide.flight.integrators import Adaptive as Adaptive
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from jaxguide.neighboring.gains import gain_schedule as gain_schedule
     from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
     from jaxguide.neighboring.linearization import linearize as linearize
-    from jaxguide.nominal.phased import PhaseEnds as PhaseEnds
     from jaxguide.nominal.phased import Phased as Phased
+    from jaxguide.nominal.phased import PhaseEnds as PhaseEnds
     from jaxguide.nominal.pseudospectral import Pseudospectral as Pseudospectral
     from jaxguide.nominal.shooting import Shooting as Shooting
     from jaxguide.problem import Free as Free
@@ -84,6 +85,7 @@ _HOME = {
     "simulate": "flight.simulate",
     "sincos": "trig",
     "solve": "solving",
+    "solve_batch": "batch",
     "sweep": "montecarlo.sweep",
 }
 _MODULES = ("plotting", "problems", "reproduce")

@@ -45,8 +45,7 @@ def solve(
     `SolveError` (with what missed, by how much and what to try) when no extremal was found.
     """
     require_x64("jg.solve")
-    if method is None:
-        method = Shooting() if _is_unconstrained(problem) else Pseudospectral()
+    method = chosen(problem) if method is None else method
     if isinstance(problem, Problem):
         method.check_fields(problem)
     validate(problem)
@@ -56,7 +55,9 @@ def solve(
     problem = with_array_leaves(problem)
     if without_end:
         problem = endless(problem, method.time_scale)
-        guess = closed(guess) if isinstance(guess, Extremal) and guess.stretch is not None else guess
+        guess = (
+            closed(guess) if isinstance(guess, Extremal) and guess.stretch is not None else guess
+        )
     if is_traced((problem, guess)):
         extremal = method(problem, guess, certifier(method.accuracy))
         return opened(extremal) if without_end else extremal
@@ -68,6 +69,24 @@ def solve(
     if throw:
         raise_if_failed(extremal)
     return extremal
+
+
+def chosen(problem: Problem) -> Any:
+    """The method where none is named."""
+    return Shooting() if _is_unconstrained(problem) else Pseudospectral()
+
+
+def on_fixed_mesh(problem: Problem, method: Any) -> Callable[[Problem, Any], Extremal]:
+    """What `solve` runs, without refinement or throwing, for problems of this one's structure,
+    which is checked here."""
+    method.check_fields(problem)
+    validate(problem)
+    method.check(problem)
+    if not (isinstance(method, Pseudospectral) and is_endless(problem)):
+        return lambda problem, guess: _run(method, problem, guess)
+    return lambda problem, guess: opened(
+        _run(method, endless(problem, method.time_scale), closed(guess) if guess else None)
+    )
 
 
 def is_endless(problem: Problem) -> bool:

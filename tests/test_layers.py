@@ -27,6 +27,7 @@ LAYERS = (
     "flight",
     "progress",
     "montecarlo",
+    "batch",
     "tuning",
     "problems",
     "plotting",

@@ -71,7 +71,9 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
         1 + r(segments, points, 1), times + r(len(times)), jnp.array([1.4]),
         r(segments, points, 2), r(len(ends)),
     )  # fmt: skip
-    y = Rows(10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(len(ends)))
+    y = Rows(
+        10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(len(ends))
+    )
     sigma, pull = jax.tree_util.tree_map(lambda a: jnp.abs(a) + 0.3, random(w)), random(w)
     no = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, bool), w)
     given = no._replace(
@@ -412,3 +414,9 @@ def test_discontinuous_dynamics_fail_the_certificate():
     e = jg.solve(Torn(), jg.Pseudospectral(nodes=4, segments=2, refinements=0), throw=False)
     rows = {row["check"]: row["passed"] for row in e.certificate.rows()}
     assert not rows["state equation"]
+
+
+def test_npsat1_on_one_segment():
+    # reference/pseudospectral.md: CasADi + IPOPT, N = 40, from any guess.
+    e = jg.solve(problems.get("npsat1"), jg.Pseudospectral("lgl", 41, 1, refinements=0))
+    np.testing.assert_allclose(e.objective, 112.2088, atol=5e-5)

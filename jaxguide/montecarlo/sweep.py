@@ -132,13 +132,15 @@ def case_key(seed: Any, case: Any) -> Array:
     return jax.random.fold_in(key, case)
 
 
-def over_cores(work: Callable[[int], Any], count: int, progress: Any = None) -> list[Any]:
+def over_cores(
+    work: Callable[[int], Any], count: int, progress: Any = None, workers: int | None = None
+) -> list[Any]:
     """`[work(0), ..., work(count - 1)]`, one thread a core: XLA flies each tile on one core and
     lets go of the interpreter lock meanwhile."""
     state = None if progress is None else progress.init()
     results = []
     try:
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
             for i, result in enumerate(pool.map(work, range(count))):
                 results.append(result)
                 if progress is not None:

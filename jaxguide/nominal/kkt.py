@@ -1,9 +1,10 @@
 """One Newton step of a transcription: its KKT system solved by elimination, segment by segment.
 
 Within a segment the defects leave a null space of start, clock and as many free directions as there
-are controls: one QR of their Jacobian. What is left, a quadratic in these, is minimised over the
-free directions from the last segment to the first (a Riccati sweep), carrying the global unknowns,
-the final state and its multiplier as parameters. A small dense system of the globals ends it.
+are controls: one LU factorisation of their transposed Jacobian. What is left, a quadratic in these,
+is minimised over the free directions from the last segment to the first (a Riccati sweep), carrying
+the global unknowns, the final state and its multiplier as parameters. A small dense system of the
+globals ends it.
 
 The inertia of the whole is right, so that the step descends, if every Cholesky factorisation exists
 and the last system has as many negative eigenvalues as multipliers (Haynsworth).
@@ -14,14 +15,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxguide.nominal.transcription import Ends, Nodes, Primal, Rows, Transcription
 
 COMPLIANCE = 1e-8  # of path constraints: an equality is a spring of stiffness 1/this
 _SOFT = 1e-11
 _STIFF = 1e16  # of what holds a given control
-_REFINEMENTS = 2
+_REFINEMENTS, _ENOUGH = 2, 1e-12
 
 
 class System(NamedTuple):
@@ -51,10 +52,11 @@ class Step(NamedTuple):
 
 class Segments(NamedTuple):
     """States and controls after each segment's start, linear in v = (start, z, clock, parameters),
-    where z spans what the defects leave free: scaled by `size`, an orthonormal basis."""
+    where z are the entries that the defects leave free, scaled by `size`."""
 
-    Q: Float[Array, "segment xu row"]
-    R: Float[Array, "segment row row"]
+    basis: Float[Array, "segment row row"]  # L and U of the basic entries
+    order: Int[Array, "segment xu"]  # the basic entries first
+    place: Int[Array, "segment xu"]  # where in that order an entry is
     size: Float[Array, "segment xu"]
     X: Float[Array, "segment after n v"]
     U: Float[Array, "segment node m v"]
@@ -96,8 +98,9 @@ def over_segments(f: Any, items: Any) -> Any:
 
 
 def eliminate(program: Transcription, system: System) -> Segments:
-    """The defects' null space, by QR: stable however unstable the dynamics are, where following
-    the states from their start would not be."""
+    """The defects' null space, by LU: stable however unstable the dynamics are, where following
+    the states from their start would not be: of states and controls alike, pivoting makes those
+    basic that the defects determine best."""
     rule, size = program.rule, program.sizes
     n, m, C, S, dtype = size.n, size.m, size.nodes, size.segments, system.sigma.x.dtype
     A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
@@ -117,13 +120,18 @@ def eliminate(program: Transcription, system: System) -> Segments:
         to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(count, -1)
         start, G = G[:, :, 0].reshape(count, n), G[:, :, 1:].reshape(count, -1)
         G = jnp.concatenate([G, to_u], axis=1) / weight[None]
-        Q, R = jnp.linalg.qr(G.T, mode="complete")
-        Q1, R = Q[:, :count], R[:count]
-        follow = lambda b: -Q1 @ solve_triangular(R, b, trans=1)
-        V = jnp.concatenate([follow(start), Q[:, count:], follow(to_clock)], axis=1)
-        return Q1, R, V / weight[:, None]
+        lu, _, order = jax.lax.linalg.lu(G.T)
+        basis, place = lu[:count], jnp.argsort(order)
+        free = -solve_triangular(basis, lu[count:].T, trans=1, lower=True, unit_diagonal=True)
+        follow = -_basic(basis, jnp.concatenate([start, to_clock], axis=1))
+        one = jnp.eye(free.shape[1], dtype=dtype)
+        V = jnp.concatenate([
+            jnp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
+            jnp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
+        ])[place]  # fmt: skip
+        return basis, order, place, V / weight[:, None]
 
-    Q, R, V = over_segments(one, (system.nodes.jacobian, weight))
+    basis, order, place, V = over_segments(one, (system.nodes.jacobian, weight))
     nv = V.shape[2]
     split = (support - 1) * n
     X, U = V[:, :split].reshape(S, support - 1, n, nv), V[:, split:].reshape(S, C, m, nv)
@@ -131,7 +139,14 @@ def eliminate(program: Transcription, system: System) -> Segments:
     x = jnp.concatenate([start, X], axis=1)[:, own]
     rest = system.nodes.jacobian.shape[3] - n - m
     clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
-    return Segments(Q, R, weight, X, U, jnp.concatenate([x, U, clock], axis=2))
+    T = jnp.concatenate([x, U, clock], axis=2)
+    return Segments(basis, order, place, weight, X, U, T)
+
+
+def _basic(basis: Array, b: Array) -> Array:
+    """The basic entries that make the defects `b`, the others zero."""
+    y = solve_triangular(basis, b, trans=1)
+    return solve_triangular(basis, y, trans=1, lower=True, unit_diagonal=True)
 
 
 def _on_controls(system: System) -> Array:
@@ -272,13 +287,17 @@ def apply(
     # What the states are with all of v at zero, and the forces that this and the load leave.
     by_segment = lambda a: a.reshape(S, -1)
     xu = lambda x, u: jnp.concatenate([by_segment(x), by_segment(u)], axis=1)
-    apart = lambda a: (a[:, : size.after * n].reshape(S, -1, n), a[:, size.after * n :].reshape(S, C, m))
+    apart = lambda a: (
+        a[:, : size.after * n].reshape(S, -1, n),
+        a[:, size.after * n :].reshape(S, C, m),
+    )
 
     def particular(item: tuple) -> Array:
-        Q, R, weight, c = item
-        return -Q @ solve_triangular(R, c, trans=1) / weight
+        basis, _, place, weight, c = item
+        moved = jnp.zeros_like(weight).at[: len(c)].set(-_basic(basis, c))
+        return moved[place] / weight
 
-    factors = (segments.Q, segments.R, segments.size)
+    factors = (segments.basis, segments.order, segments.place, segments.size)
     x_bar, u_bar = apart(over_segments(particular, (*factors, by_segment(residual.defect))))
     at_nodes = jnp.pad(x_bar, ((0, 0), (1, 0), (0, 0)))[:, own]
     at_nodes = jnp.concatenate([at_nodes, u_bar], axis=2)
@@ -342,8 +361,10 @@ def apply(
     on_states = on_states.at[:, -1].add(costate)
 
     def covector(item: tuple) -> Array:
-        Q, R, weight, f = item
-        return -solve_triangular(R, Q.T @ (f / weight))
+        basis, order, _, weight, f = item
+        f = (f / weight)[order[: len(basis)]]
+        f = solve_triangular(basis, f, lower=True, unit_diagonal=True)
+        return -solve_triangular(basis, f)
 
     rows = over_segments(covector, (*factors, xu(on_states, f[..., n:] + force.u)))
     rows = rows.reshape(S, -1, n)
@@ -426,15 +447,23 @@ def gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Row
 def solve(
     program: Transcription, system: System, segments: Segments, factor: Factor, load: Load
 ) -> Step:
-    """`apply`, refined: stiff barriers lose digits in the reduced Hessian, not in the product."""
+    """`apply`, refined where it needs to be: stiff barriers lose digits in the reduced Hessian, not
+    in the product. A Newton step that leaves a millionth of the constraints loses nothing."""
+    largest = lambda tree: jnp.max(jnp.stack([
+        jnp.max(jnp.abs(a), initial=0.0) for a in jax.tree_util.tree_leaves(tree)
+    ]))  # fmt: skip
+    add = lambda a, b: jax.tree_util.tree_map(jnp.add, a, b)
+    enough_force = _ENOUGH * jnp.maximum(1.0, largest(load.force))
+    enough_rows = 1e-6 * largest(load.residual) + 1e-15
 
-    def refine(_: Any, step: Step) -> Step:
-        got = product(program, system, factor.delta, step)
-        left = jax.tree_util.tree_map(lambda a, b: a + b, load, got)
-        better = apply(program, system, segments, factor, left)
-        return jax.tree_util.tree_map(lambda a, b: a + b, step, better)
+    def refine(carry: tuple) -> tuple:
+        count, step, left, _ = carry
+        step = add(step, apply(program, system, segments, factor, left))
+        left = add(load, product(program, system, factor.delta, step))
+        good = (largest(left.force) <= enough_force) & (largest(left.residual) <= enough_rows)
+        return count + 1, step, left, good
 
-    # From nothing, so that the elimination is compiled once.
-    blank = Step(load.force, load.residual)
-    blank = jax.tree_util.tree_map(jnp.zeros_like, blank)
-    return jax.lax.fori_loop(0, 1 + _REFINEMENTS, refine, blank)
+    blank = jax.tree_util.tree_map(jnp.zeros_like, Step(load.force, load.residual))
+    return jax.lax.while_loop(
+        lambda a: ~a[3] & (a[0] <= _REFINEMENTS), refine, (0, blank, load, jnp.array(False))
+    )[1]

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxguide.linalg import single_threaded_lapack
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal import interior_point, kkt
 from jaxguide.nominal.implicit import sensitivity
@@ -190,6 +191,7 @@ class Pseudospectral(eqx.Module):
         self, problem: Problem, guess: Any
     ) -> tuple[Transcription, Primal, interior_point.Options]:
         """The transcription in designer units, where the search starts, and how."""
+        single_threaded_lapack()
         dtype = jnp.result_type(float)
         whole = self.whole(problem)
         if self.fractions is None:

@@ -43,6 +43,7 @@ _LIBRARY = {
     "hang-glider": ("vehicles", "HangGlider"),
     "shuttle-reentry": ("shuttle", "ShuttleReentry"),
     "shuttle-reentry-heat": ("shuttle", "ShuttleReentryHeat"),
+    "npsat1": ("npsat1", "NPSAT1"),
 }
 
 

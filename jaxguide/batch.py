@@ -1,0 +1,97 @@
+"""`jg.solve_batch`: many problems of one kind, on all cores. Host only."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxguide.montecarlo.sweep import over_cores
+from jaxguide.problem import Problem, with_array_leaves
+from jaxguide.progress import Progress
+from jaxguide.solving import chosen, on_fixed_mesh, solve
+from jaxguide.trajectory import Extremal
+from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
+
+_tree = jax.tree_util.tree_map
+
+
+def solve_batch(
+    problems: Problem | Sequence[Problem],
+    method: Any = None,
+    guess: Extremal | None = None,
+    throw: bool = False,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> Extremal:
+    """Solves each of `problems` on the method's fixed mesh; one batched Extremal.
+
+    Every lane runs the program that `solve` runs, in whichever of the host threads is idle: no
+    lane waits for another, and a lane is what its own `solve` without refinement would be.
+
+    **Arguments:**
+
+    - `problems`: a Problem whose every leaf has one leading axis of lanes, such as
+      `jax.vmap(lambda k: dataclasses.replace(problem, thrust=k))(thrusts)`; or a list of Problems
+      of one class and structure.
+    - `method`, `guess`: as for `solve`; a batched Extremal is one guess a lane.
+    - `throw`: raise if a lane fails. By default failure is a value: look at `.result`.
+    - `progress`: a meter (`jaxguide.progress`); none by default.
+    - `workers`: host threads; default one a core.
+
+    **Returns:** an Extremal whose leaves have the leading axis. Under a trace lanes take turns.
+
+    **Raises:** `ValueError` for lanes that do not stack, `SolveError` naming the failed lanes.
+    """
+    require_x64("jg.solve_batch")
+    batch = problems if isinstance(problems, Problem) else _stacked(problems)
+    batch = with_array_leaves(batch)
+    count = _lanes(batch)
+    lane = lambda tree, i: _tree(lambda a: a[i], tree)
+    own = isinstance(guess, Extremal) and guess.t.ndim == 2
+    first = lane(batch, 0)
+    method = chosen(first) if method is None else method
+    if is_traced((batch, guess)):
+        one = lambda p, g: solve(p, method, g, throw=False)
+        return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)
+    # On the host, so that taking a lane costs no dispatch.
+    batch, guess = jax.device_get((batch, guess))
+    run = on_fixed_mesh(first, method)
+    work = lambda i: jax.device_get(run(lane(batch, i), lane(guess, i) if own else guess))
+    # The first alone: it compiles.
+    lanes = [work(0), *over_cores(lambda i: work(i + 1), count - 1, progress, workers)]
+    out = _tree(lambda *a: jnp.asarray(np.stack(a)), *lanes)
+    failed = np.flatnonzero(np.asarray(out.result != RESULTS.successful))
+    if throw and failed.size:
+        raise SolveError(
+            f"{failed.size} of {count} lanes failed: {', '.join(map(str, failed[:20]))}"
+            f"{', ...' if failed.size > 20 else ''}. Solve one with jg.solve to see why, or pass "
+            "throw=False and look at .result."
+        )
+    return out
+
+
+def _stacked(problems: Sequence[Problem]) -> Problem:
+    problems = [with_array_leaves(p) for p in problems]
+    if not problems:
+        raise ValueError("solve_batch: no problems were given.")
+    structures = [jax.tree_util.tree_structure(p) for p in problems]
+    for i, other in enumerate(structures):
+        if other != structures[0]:
+            raise ValueError(
+                f"solve_batch: problem {i} differs from problem 0 in class, static fields or which "
+                "entries are free; solve unlike problems in batches of their own."
+            )
+    return _tree(lambda *a: jnp.stack(a), *problems)
+
+
+def _lanes(batch: Problem) -> int:
+    sizes = {jnp.shape(a)[:1] for a in jax.tree_util.tree_leaves(batch)}
+    if len(sizes) != 1 or sizes == {()}:
+        raise ValueError(
+            f"solve_batch: leading axes of the problem's leaves are {sorted(sizes)}; every leaf "
+            "needs the same one. jax.vmap(lambda k: dataclasses.replace(problem, thrust=k))"
+            "(thrusts) makes them."
+        )
+    return sizes.pop()[0]
