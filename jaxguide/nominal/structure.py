@@ -80,7 +80,7 @@ def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
 def _lasts(t: np.ndarray, a: Any, b: Any) -> bool:
     """Whether nodes a ... b - 1 are an arc."""
     long = t[b - 1] - t[a] >= _SHARE * (t[-1] - t[0])
-    return b - a >= _MANY or (b - a >= _LEAST and bool(long))
+    return bool(b - a >= _MANY or (b - a >= _LEAST and long))
 
 
 def _calmed(t: np.ndarray, labels: np.ndarray) -> np.ndarray:
