@@ -68,9 +68,10 @@ def one_solve(name: str, N: int, tolerance: float, peer: Any, repeats: int) -> d
     x, u = (np.asarray(a) for a in p.guess(s)) if p else (None, None)
 
     def prepare(problem: Any) -> Any:
-        program, w = method.prepared(problem, None)
+        program, start, _ = method.prepared(problem, None)
         if x is None or u is None:
-            return program, w
+            return program, start
+        w = start.w
         units = program.units
         w = w._replace(
             x=jnp.asarray((x * unit_x)[None, 1:]) / units.x,
@@ -78,12 +79,12 @@ def one_solve(name: str, N: int, tolerance: float, peer: Any, repeats: int) -> d
             times=w.times.at[1].set(tf / program.scale.t),
         )
         node, end = program.values(w)
-        return program, w._replace(path=node[:, :, problem.n + 1 :], end=end[1:])
+        return program, start._replace(w=w._replace(path=node[:, :, problem.n + 1 :], end=end[1:]))
 
     program, w = jax.jit(prepare)(problem)
 
     def run(program: Any, w: Any) -> Any:
-        options = interior_point.Options(tolerance, 0.1, 500, 1e-2)
+        options = interior_point.Options(tolerance, 0.1, 500, 1e-2, False)
         sol = interior_point.minimise(program, bounds(program), w, options)
         f, _ = program.objective_and_residual(sol.w)
         return sol.status, sol.iterations, f * program.scale.objective

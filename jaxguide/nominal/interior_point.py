@@ -52,6 +52,16 @@ class Options(NamedTuple):
     mu: Any
     max_iterations: Any
     push: Any  # how far from the bounds to start, relative to them and to their distance
+    warm: Any  # whether the start's multipliers are to be believed
+
+
+class Start(NamedTuple):
+    """Where to begin: the unknowns and, from a solution nearby, multipliers of the constraints and
+    net multipliers (upper less lower) of the bounds."""
+
+    w: Primal
+    y: Rows
+    net: Primal
 
 
 class Solution(NamedTuple):
@@ -258,25 +268,26 @@ def optimality_error(
     return error
 
 
-def minimise(program: Transcription, bounds: Bounds, start: Primal, options: Options) -> Solution:
+def minimise(program: Transcription, bounds: Bounds, start: Start, options: Options) -> Solution:
     """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
     box = boxed(bounds)
     dtype = program.dtype
-    w = inside(box, start, options.push)
+    w = inside(box, start.w, options.push)
     mu = jnp.asarray(options.mu, dtype)
     low, high = distances(box, w)
-    zl = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), low, box.below)
-    zu = _tree(lambda a, on: jnp.where(on, mu / a, 0.0), high, box.above)
+    held = lambda a, z, on: jnp.where(on, jnp.maximum(mu / a, z), 0.0)
+    zl = _tree(lambda a, z, on: held(a, -z, on), low, start.net, box.below)
+    zu = _tree(lambda a, z, on: held(a, z, on), high, start.net, box.above)
     _, c = program.objective_and_residual(w)
     theta = _norm1(c)
     zero, nought = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    y = _tree(jnp.zeros_like, c)
+    mode = jnp.where(options.warm, _NEWTON, _ESTIMATE).astype(jnp.int32)
     slots = jnp.full(_FILTER, -jnp.inf, dtype)
     state = _State(
-        w, y, zl, zu, mu,
+        w, start.y, zl, zu, mu,
         _Filter(slots, slots, nought),
         1e4 * jnp.maximum(1.0, theta), 1e-4 * jnp.maximum(1.0, theta), theta,
-        zero, nought + _ESTIMATE, nought, nought + RUNNING, zero + jnp.inf,
+        zero, mode, nought, nought + RUNNING, zero + jnp.inf,
         jnp.array(False), jnp.full(_MEMORY, jnp.inf, dtype),
     )  # fmt: skip
     body = lambda s: _pass(program, box, options, s)
@@ -475,8 +486,23 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     status = jnp.where(stuck, jnp.where(feasible, STALLED, INFEASIBLE), status)
     status = jnp.where(into & feasible, STALLED, status)
     status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)
+    if program.log:
+        numbers = (s.k, f, _largest(c), error_now, mu, delta, jnp.where(accepted, alpha, 0.0))
+        jax.debug.callback(_report, s.mode, program.scale.objective, *numbers)
     return _State(
         new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
         jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
         s.k + 1, status.astype(s.status.dtype), error_now, free, errors,
     )  # fmt: skip
+
+
+def _report(mode: Any, unit: Any, k: Any, f: Any, c: Any, error: Any, *rest: Any) -> None:
+    """One line of the iteration log; objective in the user's units."""
+    if k == 0:
+        print("iter  objective        violation  error      mu       delta    step")
+    kind = " re"[int(mode)]
+    mu, delta, alpha = (float(v) for v in rest)
+    print(
+        f"{int(k):4d}{kind} {float(f) * float(unit):+.9e} {float(c):.2e}   {float(error):.2e}   "
+        f"{mu:.1e}  {delta:.1e}  {alpha:.2g}"
+    )

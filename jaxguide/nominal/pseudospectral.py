@@ -23,6 +23,7 @@ from jaxguide.nominal.transcription import (
     Arcwise,
     Bounds,
     Primal,
+    Rows,
     Scale,
     Transcription,
     bounds,
@@ -73,6 +74,8 @@ class Pseudospectral(eqx.Module):
       breaks, and frees the junctions of a clear structure) until each segment's defect between the
       nodes, relative to the state's span, is below `mesh_tolerance`. Zero: one solve. Under a
       trace the mesh stays.
+    - `log`: print the optimiser's iterations: objective, worst constraint, scaled error, barrier,
+      regularisation, step; "r" marks restoration, "e" an estimate of the multipliers.
 
     **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
 
@@ -93,6 +96,7 @@ class Pseudospectral(eqx.Module):
     max_iterations: int = eqx.field(static=True, default=500)
     refinements: int = eqx.field(static=True, default=4)
     mesh_tolerance: float = eqx.field(static=True, default=1e-7)
+    log: bool = eqx.field(static=True, default=False)
     accuracy = 1e-6  # that its certificates ask for
 
     def __check_init__(self):
@@ -189,7 +193,7 @@ class Pseudospectral(eqx.Module):
 
     def prepared(
         self, problem: Problem, guess: Any
-    ) -> tuple[Transcription, Primal, interior_point.Options]:
+    ) -> tuple[Transcription, interior_point.Start, interior_point.Options]:
         """The transcription in designer units, where the search starts, and how."""
         single_threaded_lapack()
         dtype = jnp.result_type(float)
@@ -202,8 +206,9 @@ class Pseudospectral(eqx.Module):
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
         program = Transcription(
-            whole, unit, edges(fractions, self.knots), family, self.nodes, self._arcwise(whole)
-        )
+            whole, unit, edges(fractions, self.knots), family, self.nodes, self._arcwise(whole),
+            self.log,
+        )  # fmt: skip
         if guess is None:
             w = straight_guess(program, fractions, self.knots)
         elif is_key(guess):
@@ -220,16 +225,23 @@ class Pseudospectral(eqx.Module):
         w = jax.tree_util.tree_map(jnp.divide, w, program.units)
         node, end = program.values(w)
         w = w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+        start = interior_point.Start(w, *blank_duals(program, w))
         # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
-        mu, push = (1e-3, 1e-3) if isinstance(guess, Extremal) else (0.1, 1e-2)
-        options = interior_point.Options(self.tolerance, mu, self.max_iterations, push)
-        return *jax.lax.stop_gradient((program, w)), jax.tree_util.tree_map(jnp.asarray, options)
+        mu, push, warm = 0.1, 1e-2, False
+        if isinstance(guess, Extremal):
+            mu, push = 1e-3, 1e-3
+            if fits(program, guess):
+                start, warm = start._replace(**duals(program, fractions, w, guess)), True
+                mu, push = 1e-6, 1e-6
+        options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
+        out = jax.lax.stop_gradient((program, start))
+        return *out, jax.tree_util.tree_map(jnp.asarray, options)
 
 
 def finished(
     problem: Problem,
     program: Transcription,
-    start: Primal,
+    start: interior_point.Start,
     options: interior_point.Options,
     certifier: Any,
 ) -> Extremal:
@@ -263,7 +275,7 @@ def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Arr
 
 @jax.custom_batching.sequential_vmap
 def _one_at_a_time(
-    program: Transcription, box: Bounds, start: Primal, options: interior_point.Options
+    program: Transcription, box: Bounds, start: interior_point.Start, options: interior_point.Options
 ) -> interior_point.Solution:
     """Under `vmap` one problem after another: batched LAPACK may hang on CPU and gains nothing."""
     return interior_point.minimise(program, box, start, options)
@@ -271,7 +283,7 @@ def _one_at_a_time(
 
 @eqx.filter_custom_jvp
 def _solved(
-    problem: Problem, program: Transcription, start: Primal, options: interior_point.Options
+    problem: Problem, program: Transcription, start: interior_point.Start, options: interior_point.Options
 ) -> interior_point.Solution:
     """The solution for `problem` in the units and on the mesh of `program`."""
     program = eqx.tree_at(lambda p: p.problem, program, problem)
@@ -432,6 +444,62 @@ def from_extremal(
     p = [start_value(v) for v in parameters(guess.problem, like=problem)]
     times = placed(t0, tf, fractions, knots)
     return without_slacks(program, fill(guess.x[0], size.n), x, u, times, p)
+
+
+def blank_duals(program: Transcription, w: Primal) -> tuple[Rows, Primal]:
+    """No multipliers."""
+    size = program.sizes
+    defect = jnp.zeros((size.segments, program.rule.A.shape[0], size.n), program.dtype)
+    zeros = jax.tree_util.tree_map(jnp.zeros_like, w)
+    return Rows(defect, zeros.path, zeros.end), zeros
+
+
+def fits(program: Transcription, guess: Extremal) -> bool:
+    """Whether the covectors of `guess` are those of this problem's constraints."""
+    size, m = program.sizes, guess.multipliers
+    ends = m.endpoint.shape[0] + m.integral.shape[0]
+    return (
+        guess.costate.shape[1] + m.integral.shape[0] == size.n
+        and ends == size.end - len(program.order)
+        and m.path.shape[1] == size.path
+    )
+
+
+def duals(
+    program: Transcription, fractions: Float[Array, " edge"], w: Primal, guess: Extremal
+) -> dict[str, Any]:
+    """`costates` and the multipliers of `to_extremal` undone: those of `guess` on this mesh."""
+    size, rule, scale, dtype = program.sizes, program.rule, program.scale, program.dtype
+    t0, tf = guess.t[0], guess.t[-1]
+    times = t0 + (tf - t0) * fractions_at(fractions, np.append(rule.nodes, 1.0))
+    m, r = guess.multipliers, guess.multipliers.integral
+    costate = jax.vmap(jax.vmap(guess.point))(times).costate
+    # An integral's costate is its multiplier, all along.
+    constant = jnp.broadcast_to(r, (*costate.shape[:2], r.shape[0]))
+    lam = jnp.concatenate([costate, constant], axis=2) * (scale.x / scale.objective)[None, None]
+    weight = jnp.asarray(rule.w, dtype)[None, :, None]
+    nodal, end = lam[:, :-1], lam[:, -1:]
+    defect = -weight * nodal
+    if rule.A.shape[0] > size.nodes:  # LG: the last row is the quadrature to the end
+        defect = jnp.concatenate([-weight * (nodal - end), -end], axis=1)
+    spans = program.clocks @ w.times
+    clock = weight * ((spans[:, 1] - spans[:, 0]) / 2)[:, None, None] * scale.t / scale.objective
+    held = jnp.concatenate([m.path, m.state, m.control], axis=1)
+    held = jax.vmap(jax.vmap(lambda t: guess.interpolate(held, t)))(times[:, :-1])
+    path, state, control = jnp.split(held, np.cumsum([m.path.shape[1], m.state.shape[1]]), axis=2)
+    wide = lambda a, k: jnp.pad(a, ((0, 0), (0, 0), (0, k - a.shape[2])))
+    path = path * clock * scale.path[None, None]
+    end = jnp.concatenate([m.endpoint, r]) / scale.objective
+    end = jnp.pad(end, (0, size.end - end.shape[0])) * scale.end
+    on_states = jnp.zeros_like(w.x)
+    first = 1 - rule.first  # of the nodes, the first that follows the segment's start
+    state = wide(state, size.n) * clock * scale.x[None, None]
+    on_states = on_states.at[:, : size.nodes - first].set(state[:, first:])
+    zeros = jax.tree_util.tree_map(jnp.zeros_like, w)
+    net = zeros._replace(
+        x=on_states, u=wide(control, size.m) * clock * scale.u[None, None], path=path, end=end
+    )
+    return {"y": Rows(defect, path, end), "net": net}
 
 
 def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:

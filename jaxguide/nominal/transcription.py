@@ -114,6 +114,7 @@ class Transcription(eqx.Module):
     family: str = eqx.field(static=True)
     points: int = eqx.field(static=True)
     arcwise: "Arcwise | None" = None
+    log: bool = eqx.field(static=True, default=False)  # print the optimiser's iterations
 
     @property
     def rule(self) -> Collocation:
