@@ -10,7 +10,9 @@ import sys
 import time
 
 SMOKE = ("moon-lander", "double-integrator")
-HEAD = "| problem | objective | relative error | known to | mesh | certificate: rows that fail | s |"
+HEAD = (
+    "| problem | objective | relative error | known to | mesh | certificate: rows that fail | s |"
+)
 
 
 def solved(name: str) -> dict:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jaxguide import problems as problems
     from jaxguide.batch import solve_batch as solve_batch
+    from jaxguide.bellman import Bellman as Bellman
+    from jaxguide.bellman import bellman as bellman
     from jaxguide.certificate import Certificate as Certificate
     from jaxguide.certificate import certify as certify
     from jaxguide.flight.integrators import Adaptive as Adaptive
@@ -51,6 +53,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Adaptive": "flight.integrators",
+    "Bellman": "bellman",
     "Certificate": "certificate",
     "Command": "laws.law",
     "Extremal": "trajectory",
@@ -77,6 +80,7 @@ _HOME = {
     "SolveError": "types",
     "Trajectory": "trajectory",
     "Uniform": "montecarlo.dispersions",
+    "bellman": "bellman",
     "certify": "certificate",
     "gain_schedule": "neighboring.gains",
     "linear_covariance": "montecarlo.covariance",

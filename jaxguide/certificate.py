@@ -234,7 +234,9 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     if extremal.costate_before is not None:
         # At a break the costate may jump, by a covector of a bound that is met there.
         jumps = (extremal.costate_before[:-1] - costate[step:-1:step]) / lam_span
-        held_there = jax.vmap(_slackness, in_axes=(0, 0, None))(jumps, x[step:-1:step], problem.state_bounds)
+        held_there = jax.vmap(_slackness, in_axes=(0, 0, None))(
+            jumps, x[step:-1:step], problem.state_bounds
+        )
         rows.add("costate jumps", costates, held_there, breaks[1:-1], tight)
     drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
     gap = (h_node[step::step] - h_node[0] - drift) / h_scale
@@ -244,11 +246,15 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
         # own quadrature, does not (reference: 1/2 sum w lambda^T f).
         own = legendre_matrix(extremal.reference_nodes)[0]
         of_parts = lambda t, x, u, c: jax.vmap(jax.vmap(value))(t, x, u, c)
-        parts = of_parts(extremal.by_segment(t[:, None])[..., 0], extremal.by_segment(x), u_parts, lam_parts)
+        parts = of_parts(
+            extremal.by_segment(t[:, None])[..., 0], extremal.by_segment(x), u_parts, lam_parts
+        )
         mean = jnp.sum(2 * half * (parts @ own)) / (tf - t0)
         ahead = drift[-1] - jnp.concatenate([jnp.zeros(1, t.dtype), drift[:-1]])
         ahead = jnp.sum(half * 2 * ahead) / (tf - t0)
-        rows.add("H on average", ("H",), ((mean + ahead + g[3]) / h_scale)[None, None], tf[None], tight)
+        rows.add(
+            "H on average", ("H",), ((mean + ahead + g[3]) / h_scale)[None, None], tf[None], tight
+        )
     h_u = jax.vmap(jax.grad(constrained_hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0, 0))(
         problem, t, x, u, costate, held
     )
@@ -278,7 +284,9 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
 
     rows.add(
         "complementarity",
-        tuple(f"path {i}" for i in range(multipliers.path.shape[1])) + states + problem.control_names,
+        tuple(f"path {i}" for i in range(multipliers.path.shape[1]))
+        + states
+        + problem.control_names,
         _complementarity(extremal) / h_scale,
         t,
         tight,

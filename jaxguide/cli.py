@@ -147,7 +147,9 @@ def reproduce(name: str, *, out: Path | None = None, common: Common = Common()) 
 
 
 @app.command
-def solve(name: str, *, out: Path | None = None, common: Common = Common()) -> Outcome:
+def solve(
+    name: str, *, plot: bool = False, out: Path | None = None, common: Common = Common()
+) -> Outcome:
     """Solve a problem of the library and certify the extremal.
 
     Exits with 1 if a row of the certificate fails.
@@ -156,12 +158,15 @@ def solve(name: str, *, out: Path | None = None, common: Common = Common()) -> O
     ----------
     name
         A problem, as `jaxguide problems` lists them.
+    plot
+        Write a figure of states, controls and costates.
     out
-        Folder for the figure.
+        Folder for the figure, which it asks for; with --plot alone, the current one.
     """
     from jaxguide import problems as library
 
-    problem, extremal = _solved(name)
+    out = Path() if plot and out is None else out
+    problem, extremal = _solved(name, watch=lambda step: print(step, file=sys.stderr))
     known = library.reference(name)
     with waiting(RichProgress("certificate")):
         certificate = extremal.certificate
@@ -391,7 +396,7 @@ def doctor(*, common: Common = Common()) -> Outcome:
 COMMANDS = (problems, reproduce, solve, gains, fly, sweep, doctor)
 
 
-def _solved(name: str) -> tuple[Any, Any]:
+def _solved(name: str, watch: Any = None) -> tuple[Any, Any]:
     """A problem of the library and its extremal."""
     from jaxguide import problems as library
 
@@ -399,7 +404,7 @@ def _solved(name: str) -> tuple[Any, Any]:
     import jaxguide as jg
 
     with waiting(RichProgress(f"solve {name}")):
-        return problem, jg.solve(problem)
+        return problem, jg.solve(problem, watch=watch)
 
 
 def _result(result: Any) -> dict[str, Any]:

@@ -155,7 +155,9 @@ def with_parameters(problem: Problem, p: Any) -> Problem:
 
 def parameters(problem: Problem, like: Problem | None = None) -> list[Any]:
     """The entries of `problem` at its (or `like`'s) parameter paths."""
-    return [_follow(problem, path) for path in (problem if like is None else like).parameter_paths()]
+    return [
+        _follow(problem, path) for path in (problem if like is None else like).parameter_paths()
+    ]
 
 
 def _follow(tree: Any, path: Path) -> Any:

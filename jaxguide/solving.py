@@ -33,8 +33,9 @@ def solve(
     - `problem`: the Problem; its parameters may be traced, so this may be `vmap`ped and
       differentiated (implicitly, forward and reverse).
     - `method`: `jg.Shooting` or `jg.Pseudospectral`. Default: shooting, the more accurate, unless
-      the Problem has bounds, path constraints or what else shooting cannot do. Where its bounds
-      are traced that cannot be seen: name the method, or look for `bounds_violated`.
+      the Problem has bounds, path constraints or what else shooting cannot do; where shooting
+      finds nothing, a direct solution, polished by shooting from there if that succeeds. Under a
+      trace bounds cannot be seen: name the method, or look for `bounds_violated`.
     - `guess`: None, an Extremal of a similar problem, initial costates (n,) for shooting, or a
       `jax.random.key` for a random start of a direct solve.
     - `watch`: called after each solve of a direct method's refinement with what it is and how
@@ -45,6 +46,8 @@ def solve(
     `SolveError` (with what missed, by how much and what to try) when no extremal was found.
     """
     require_x64("jg.solve")
+    if method is None and not is_traced((problem, guess)):
+        return _by_default(problem, guess, throw, watch)
     method = chosen(problem) if method is None else method
     if isinstance(problem, Problem):
         method.check_fields(problem)
@@ -66,6 +69,23 @@ def solve(
         extremal = refined(_run, method, problem, extremal, watch or (lambda _: None))
     if without_end:
         extremal = opened(extremal)
+    if throw:
+        raise_if_failed(extremal)
+    return extremal
+
+
+def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Extremal:
+    """With the method `chosen`; where shooting finds nothing by itself, from a direct solution."""
+    method = chosen(problem)
+    if not isinstance(method, Shooting):
+        return solve(problem, method, guess, throw, watch)
+    extremal = solve(problem, method, guess, throw=False)
+    if extremal.result == RESULTS.successful:
+        return extremal
+    direct = solve(problem, Pseudospectral(), throw=False, watch=watch)
+    if direct.result == RESULTS.successful:
+        polished = solve(problem, method, direct, throw=False)
+        return polished if polished.result == RESULTS.successful else direct
     if throw:
         raise_if_failed(extremal)
     return extremal
@@ -156,7 +176,8 @@ def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
 
 @functools.cache
 def _quick(function: Callable[..., Any]) -> Callable[..., Any]:
-    return eqx.filter_jit(function, compiler_options=quick_compilation() or None)
+    options: Any = {"compiler_options": quick_compilation() or None}
+    return eqx.filter_jit(function, **options)
 
 
 def raise_if_failed(extremal: Extremal) -> None:

@@ -23,6 +23,7 @@ LAYERS = (
     "neighboring",
     "certificate",
     "solving",
+    "bellman",
     "laws",
     "flight",
     "progress",

@@ -138,7 +138,7 @@ def test_double_integrator(grid, nodes, segments):
 
 
 def test_free_final_time():
-    e = jg.solve(FreeTime(), jg.Pseudospectral("lg", 6, 2))
+    e = jg.solve(FreeTime(), jg.Pseudospectral("lg", 6, 2, refinements=0))
     np.testing.assert_allclose(e.final_time, 18**0.25, rtol=1e-9)
     assert np.all(e.certificate.passed), str(e.certificate)
 
@@ -202,6 +202,7 @@ def test_contradictory_ends_are_infeasible():
         jg.solve(Torn(), method)
 
 
+@pytest.mark.slow  # four programs
 def test_implicit_derivatives_with_an_active_bound():
     """d tf of a bang-bang landing by gravity, the thrust limit and the initial height, both ways,
     against finite differences of solutions on the same mesh."""
@@ -416,7 +417,36 @@ def test_discontinuous_dynamics_fail_the_certificate():
     assert not rows["state equation"]
 
 
+@pytest.mark.slow
 def test_npsat1_on_one_segment():
     # reference/pseudospectral.md: CasADi + IPOPT, N = 40, from any guess.
     e = jg.solve(problems.get("npsat1"), jg.Pseudospectral("lgl", 41, 1, refinements=0))
     np.testing.assert_allclose(e.objective, 112.2088, atol=5e-5)
+
+
+def test_warm_start_with_multipliers(capfd):
+    """A solution of one mesh is one of the next, but for a few steps; the log counts them."""
+    method = jg.Pseudospectral(nodes=5, segments=4, refinements=0, log=True)
+    cold = jg.solve(problems.get("brachistochrone-wall"), method)
+    jax.effects_barrier()
+    first = capfd.readouterr().out.splitlines()
+    moved = dataclasses.replace(method, fractions=np.array([0.0, 0.2, 0.45, 0.7, 1.0]))
+    jg.solve(problems.get("brachistochrone-wall"), moved, guess=cold)
+    jax.effects_barrier()
+    second = capfd.readouterr().out.splitlines()
+    assert first[0].split() == ["iter", "objective", "violation", "error", "mu", "delta", "step"]
+    assert len(second) < len(first) / 2
+
+
+def test_bellman_segments_do_not_add_up_errors():
+    problem = problems.get("brachistochrone")
+    method = jg.Pseudospectral("lgl", 5, 1, refinements=0)
+
+    def miss(segments):
+        b = jg.bellman(problem, method, segments)
+        assert bool(b.result == jg.RESULTS.successful)
+        end = problem.endpoint_constraints(b.x[0], b.x[-1], b.t[0], b.t[-1])
+        return float(jnp.max(jnp.abs(end)))
+
+    # What remains is half as long, so its interpolation error a 2^5th of that of the whole.
+    assert 1e-10 < miss(2) < miss(1) / 8

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.nominal.wrappers import count, endpoint_count, initial_entries
-from jaxguide.problem import Free, Problem, bounds_of, is_free, start_value, with_parameters
+from jaxguide.problem import Free, Problem, bounds_of, is_free, start_value
 from jaxguide.trajectory import Extremal, Multipliers
+from jaxguide.types import is_traced
 
 
 class PhaseEnds(NamedTuple):
@@ -150,15 +150,13 @@ class Phased(Problem):
         own = [endpoint_count(p) for p in problem.phases]
         nu = cut(m.endpoint[: sum(own)], own)
         out = []
-        for i, (phase, (t0, tf)) in enumerate(
-            zip(problem.phases, problem.horizons(), strict=True)
-        ):
+        for i, (phase, (t0, tf)) in enumerate(zip(problem.phases, problem.horizons(), strict=True)):
             span = tf - t0
             covectors = Multipliers(
                 nu[i], path[i] / span, per_state(m.state)[i] / span,
                 per_control(m.control)[i] / span, integral[i],
             )  # fmt: skip
-            start = per_state(extremal.x)[i][0]
+            start = problem.split_state(extremal.x)[i][0]
             phase = dataclasses.replace(
                 phase, initial_time=t0, final_time=tf, initial_state=tuple(start)
             )
@@ -194,7 +192,7 @@ def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
 def _blank_ends(phases: tuple[Problem, ...]) -> tuple[PhaseEnds, ...]:
     for phase in phases:
         tf = phase.final_time
-        if not is_free(tf) and not isinstance(tf, jax.core.Tracer) and math.isinf(float(tf)):
+        if not is_free(tf) and not is_traced(tf) and math.isinf(float(tf)):
             raise ValueError(f"Phased: {type(phase).__name__}.final_time is infinite; give an end.")
     zero = jnp.zeros((), jnp.result_type(float))
     return tuple(PhaseEnds(jnp.zeros(p.n), jnp.zeros(p.n), zero, zero) for p in phases)

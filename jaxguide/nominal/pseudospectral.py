@@ -46,7 +46,6 @@ from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS, is_traced
 
-
 _MOST_NODES = 512
 
 
@@ -275,7 +274,10 @@ def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Arr
 
 @jax.custom_batching.sequential_vmap
 def _one_at_a_time(
-    program: Transcription, box: Bounds, start: interior_point.Start, options: interior_point.Options
+    program: Transcription,
+    box: Bounds,
+    start: interior_point.Start,
+    options: interior_point.Options,
 ) -> interior_point.Solution:
     """Under `vmap` one problem after another: batched LAPACK may hang on CPU and gains nothing."""
     return interior_point.minimise(program, box, start, options)
@@ -283,7 +285,10 @@ def _one_at_a_time(
 
 @eqx.filter_custom_jvp
 def _solved(
-    problem: Problem, program: Transcription, start: interior_point.Start, options: interior_point.Options
+    problem: Problem,
+    program: Transcription,
+    start: interior_point.Start,
+    options: interior_point.Options,
 ) -> interior_point.Solution:
     """The solution for `problem` in the units and on the mesh of `program`."""
     program = eqx.tree_at(lambda p: p.problem, program, problem)

@@ -200,7 +200,7 @@ def structured(
         singular = affine & (found.active[arc, :m] == 0)
         count = 1 if singular.any() else max(2, int(np.ceil(_SEGMENTS_A_HORIZON * (b - a))))
         breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
-        held += [found.active[arc, :m]] * count
+        held += [found.active[arc, :m].astype(float)] * count
         smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
         # With every control held a state bound is implied but for one point, the arc's last.
         implied = (found.active[arc, m : m + n] != 0) & np.all(found.active[arc, :m] != 0)
@@ -212,7 +212,6 @@ def structured(
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
     known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released)))
-    known = eqx.tree_at(lambda k: k.held, known, known.held.astype(known.smooth.dtype))
     knotted = _meshed(method, np.array(breaks), _KNOTTED_NODES, tuple(knots), known)
     exact = run(knotted, problem, extremal)
     error = float(jnp.max(segment_errors(exact)))

@@ -23,7 +23,6 @@ from jaxguide.problem import (
 )
 from jaxguide.spectral import legendre_matrix
 
-
 _APART = 1e-6  # the least distance of free knots, of the horizon
 
 
@@ -316,7 +315,10 @@ def bounds(program: Transcription) -> Bounds:
     controls = bounds_of(problem.control_bounds, size.m, dtype)
     path = bounds_of(problem.path_bounds, size.path, dtype)
     end = bounds_of(problem.endpoint_bounds, size.end - len(program.order), dtype)
-    apart = (jnp.full(len(program.order), _APART, dtype), jnp.full(len(program.order), jnp.inf, dtype))
+    apart = (
+        jnp.full(len(program.order), _APART, dtype),
+        jnp.full(len(program.order), jnp.inf, dtype),
+    )
 
     u = [over(b / scale.u, size.segments, size.nodes) for b in controls]
     x = [over(b / scale.x, size.segments, size.after) for b in states]
