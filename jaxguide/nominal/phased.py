@@ -177,7 +177,7 @@ def _join(pairs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
-    """Initial entries; a free one without a guess starts where the state of that name did before."""
+    """Initial entries; one free without a guess starts where the state of its name did before."""
     seen: dict[str, Any] = {}
     out = []
     for phase in phases:

@@ -111,8 +111,8 @@ class Pseudospectral(eqx.Module):
             raise ValueError(f"Pseudospectral: starts is {self.starts}; give at least 1.")
         if self.nodes > _MOST_NODES:
             raise ValueError(
-                f"Pseudospectral: nodes is {self.nodes}; at most {_MOST_NODES} a segment, where the "
-                "interpolation still keeps its digits: use more segments."
+                f"Pseudospectral: nodes is {self.nodes}; give at most {_MOST_NODES}, with which "
+                "interpolation still keeps its digits, and more segments."
             )
         if self.refinements < 0:
             raise ValueError(f"Pseudospectral: refinements is {self.refinements}; need at least 0.")
@@ -153,9 +153,9 @@ class Pseudospectral(eqx.Module):
         if need > have:
             segments = self.segments if self.fractions is None else len(self.fractions) - 1
             raise ValueError(
-                f"Pseudospectral: {segments} segments of {self.nodes} nodes with {problem.n} states "
-                f"and {problem.m} controls need some {need / 1e9:.3g} GB of the {have / 1e9:.3g} GB "
-                "here; use fewer nodes and more segments."
+                f"Pseudospectral: {segments} segments of {self.nodes} nodes with {problem.n} "
+                f"states and {problem.m} controls need some {need / 1e9:.3g} GB of the "
+                f"{have / 1e9:.3g} GB here; use fewer nodes and more segments."
             )
 
     def memory(self, problem: Problem) -> float:

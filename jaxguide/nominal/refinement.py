@@ -4,6 +4,7 @@ stop. Host only.
 **Source:** review, section 4.4 and the remarks on knots.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -35,6 +36,7 @@ _MOST_MOVES = 6  # of the breaks of one size of mesh
 _MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise
 _SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
 _WRONG = 1e-2  # complementarity of a structure, relative to H, beyond which it is not believed
+_EXACT = 1e-11  # tolerance of its conditions
 _KNOTTED_NODES, _SEGMENTS_A_HORIZON = 12, 8  # of the mesh with free knots
 
 
@@ -171,8 +173,8 @@ def _meshed(
 ) -> Pseudospectral:
     return Pseudospectral(
         method.grid, nodes, len(fractions) - 1, fractions, knots, arcwise, method.relaxation,
-        method.time_scale, 1, method.seed, method.tolerance, method.max_iterations, method.refinements,
-        method.mesh_tolerance,
+        method.time_scale, 1, method.seed, method.tolerance, method.max_iterations,
+        method.refinements, method.mesh_tolerance,
     )  # fmt: skip
 
 
@@ -212,6 +214,7 @@ def structured(
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
     known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released)))
+    method = dataclasses.replace(method, tolerance=min(method.tolerance, _EXACT))
     knotted = _meshed(method, np.array(breaks), _KNOTTED_NODES, tuple(knots), known)
     exact = run(knotted, problem, extremal)
     error = float(jnp.max(segment_errors(exact)))
