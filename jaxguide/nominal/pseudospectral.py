@@ -187,7 +187,10 @@ class Pseudospectral(eqx.Module):
             return None
         more = lambda a, k: jnp.pad(a, (*((0, 0),) * (a.ndim - 1), (0, k - a.shape[-1])))
         return Arcwise(
-            more(known.held, whole.m), more(known.smooth, whole.m), more(known.released, whole.n)
+            more(known.held, whole.m),
+            more(known.smooth, whole.m),
+            more(known.released, whole.n),
+            known.unpathed,
         )
 
     def prepared(

@@ -35,7 +35,9 @@ _MOST_NODES, _MOST_SEGMENTS = 14, 96
 _MOST_MOVES = 6  # of the breaks of one size of mesh
 _MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise
 _SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
-_WRONG = 1e-2  # complementarity of a structure, relative to H, beyond which it is not believed
+# Complementarity of a structure, relative to H: up to which it is right, and beyond which wrong.
+# Between, an arc is missing or one too many: better than a mesh, but a finer one may tell.
+_RIGHT, _WRONG, _ATTEMPTS = 1e-5, 1e-2, 3
 _EXACT = 1e-11  # tolerance of its conditions
 _KNOTTED_NODES, _SEGMENTS_A_HORIZON = 12, 8  # of the mesh with free knots
 
@@ -118,6 +120,7 @@ def refined(
     error = float(jnp.max(segment_errors(extremal)))
     watch(Progress("first mesh", extremal, error))
     original, worst, moves, raised, tried = method, np.inf, 0, 0, -1
+    candidate, doubt = None, np.inf
     while raised <= method.refinements:
         errors = np.asarray(segment_errors(extremal))
         if extremal.result != RESULTS.successful or not np.all(np.isfinite(errors)):
@@ -127,11 +130,13 @@ def refined(
         smooth = not len(found.junctions) and method.nodes < _MOST_NODES
         # Moving breaks costs no compilation: for as long as it helps.
         move = not (smooth and resolved) and moves < _MOST_MOVES and errors.max() < 0.5 * worst
-        if (moves or resolved) and not (move and moves < 2) and tried < min(raised, 1):
+        if (moves or resolved) and not (move and moves < 2) and tried < min(raised, _ATTEMPTS - 1):
             tried = raised
-            exact = structured(run, original, problem, extremal, found, watch)
-            if exact is not None:
+            exact, wrong = structured(run, original, problem, extremal, found, watch)
+            if wrong <= _RIGHT:
                 return exact
+            if wrong <= _WRONG and wrong < doubt:
+                candidate, doubt = exact, wrong
         if resolved and (len(found.junctions) or float(tails(extremal)) <= method.mesh_tolerance):
             break
         fractions = _fractions(extremal)
@@ -156,7 +161,7 @@ def refined(
             break
         if error < errors.max() or step != "breaks moved":
             extremal = better
-    return extremal
+    return extremal if candidate is None else candidate
 
 
 def _fractions(extremal: Extremal) -> np.ndarray:
@@ -185,18 +190,19 @@ def structured(
     extremal: Extremal,
     found: Arcs,
     watch: Callable[[Progress], None],
-) -> Extremal | None:
-    """The extremal of the structure `found`, or None where that is not clear, or not better."""
+) -> tuple[Extremal, float]:
+    """The extremal of the structure `found`, and how wrong that is: its complementarity; infinite
+    where it is not clear, not resolved or not feasible."""
     n, m, junctions = problem.n, problem.m, found.junctions
     switches = np.any(np.diff(found.active[:, :m], axis=0), axis=1)
     if not 0 < len(junctions) <= _MOST_JUNCTIONS or not switches.any():
-        return None
+        return extremal, np.inf
     if isinstance(problem, Endless):
-        return None
+        return extremal, np.inf
     affine = _affine(extremal)
     t0, tf = float(extremal.t[0]), float(extremal.t[-1])
     main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
-    breaks, knots, held, smooth, released = [0.0], [], [], [], []
+    breaks, knots, held, smooth, released, unpathed = [0.0], [], [], [], [], []
     for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
         # A singular arc gets one polynomial: more would let its control chatter.
         singular = affine & (found.active[arc, :m] == 0)
@@ -205,7 +211,9 @@ def structured(
         held += [found.active[arc, :m].astype(float)] * count
         smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
         # With every control held a state bound is implied but for one point, the arc's last.
-        implied = (found.active[arc, m : m + n] != 0) & np.all(found.active[arc, :m] != 0)
+        settled = np.all(found.active[arc, :m] != 0)
+        implied = (found.active[arc, m : m + n] != 0) & settled
+        unpathed += [(found.active[arc, m + n :] != 0) & settled] * count
         if released:
             released[-1] = released[-1] | np.stack([np.zeros(n, bool), implied])
         released += [np.stack([implied, implied])] * count
@@ -213,20 +221,22 @@ def structured(
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
-    known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released)))
-    method = dataclasses.replace(method, tolerance=min(method.tolerance, _EXACT))
+    known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released, unpathed)))
+    asked = method.tolerance
+    method = dataclasses.replace(method, tolerance=min(asked, _EXACT))
     knotted = _meshed(method, np.array(breaks), _KNOTTED_NODES, tuple(knots), known)
     exact = run(knotted, problem, extremal)
+    if exact.result != RESULTS.successful:
+        knotted = dataclasses.replace(knotted, tolerance=asked)
+        exact = run(knotted, problem, exact)
     error = float(jnp.max(segment_errors(exact)))
     watch(Progress("free knots", exact, error))
-    before = float(jnp.max(segment_errors(extremal)))
-    good = exact.result == RESULTS.successful and error <= max(method.mesh_tolerance, 0.0)
-    if not good or error > before and error > 1e-9:
-        return None
+    if exact.result != RESULTS.successful or error > method.mesh_tolerance:
+        return exact, np.inf
     # A wrong structure shows in multipliers of the wrong sign, or bounds left between nodes.
-    wrong = {row["check"]: row["value"] for row in exact.certificate.rows()}
-    bounded = max(wrong["control bounds"], wrong["state bounds"]) <= 1e-6
-    return exact if bounded and wrong["complementarity"] <= _WRONG else None
+    value = {row["check"]: row["value"] for row in exact.certificate.rows()}
+    left = max(value["control bounds"], value["state bounds"], value.get("path constraints", 0.0))
+    return exact, value["complementarity"] if left <= 1e-6 else np.inf
 
 
 @eqx.filter_jit

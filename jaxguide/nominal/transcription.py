@@ -95,12 +95,14 @@ class Arcwise(eqx.Module):
       added to the objective: for singular arcs, where nothing else keeps a control from
       oscillating. Where the true control is smooth their share of the objective vanishes.
     - `released`: states whose bounds are implied by controls held, and would only have multipliers
-      of their own choice; the last point of a segment counts by itself.
+      of their own choice; the last point of a segment counts by itself. `unpathed`: likewise path
+      constraints.
     """
 
     held: Float[Array, "segment m"]
     smooth: Float[Array, "segment m"]
     released: Bool[Array, "segment two n"]
+    unpathed: Bool[Array, "segment h"]
 
 
 class Transcription(eqx.Module):
@@ -322,12 +324,15 @@ def bounds(program: Transcription) -> Bounds:
 
     u = [over(b / scale.u, size.segments, size.nodes) for b in controls]
     x = [over(b / scale.x, size.segments, size.after) for b in states]
+    h = [over(b / scale.path, size.segments, size.nodes) for b in path]
     if program.arcwise is not None:
         at = program.arcwise.held[:, None]
         u = [jnp.where(at > 0, u[1], u[0]), jnp.where(at < 0, u[0], u[1])]
         inner, last = jnp.split(program.arcwise.released, 2, axis=1)
         free = jnp.concatenate([jnp.repeat(inner, size.after - 1, axis=1), last], axis=1)
         x = [jnp.where(free, side, b) for side, b in zip((-jnp.inf, jnp.inf), x, strict=True)]
+        free = program.arcwise.unpathed[:, None]
+        h = [jnp.where(free, side, b) for side, b in zip((-jnp.inf, jnp.inf), h, strict=True)]
 
     def side(i: int) -> Primal:
         return Primal(
@@ -336,7 +341,7 @@ def bounds(program: Transcription) -> Bounds:
             u[i],
             jnp.stack([t[i] for t in times]) / scale.t,
             (jnp.stack([v[i] for v in p]) if p else jnp.zeros(0, dtype)) / scale.p,
-            over(path[i] / scale.path, size.segments, size.nodes),
+            h[i],
             jnp.concatenate([end[i] / scale.end[: len(end[i])], apart[i]]),
         )
 
