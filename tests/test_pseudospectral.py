@@ -166,6 +166,7 @@ def test_state_constraint_has_a_multiplier_of_the_right_sign():
     assert np.all(np.asarray(e.x[:, 0]) <= 1 / 9 + 1e-8)
     # The bound pushes down: the costate of x only falls, by density or at once, from 18 to -18.
     step = e.degree
+    assert e.costate_before is not None
     jumps = e.costate_before[:-1, 0] - e.costate[step:-1:step, 0]
     # Along the boundary the mesh leaves 1e-5 of the costate.
     assert min(float(jumps.min()), float(e.multipliers.state[:, 0].min())) > -36e-5
