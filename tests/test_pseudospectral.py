@@ -13,8 +13,8 @@ import jaxguide as jg
 from jaxguide import problems
 from jaxguide.nominal import kkt
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
-from jaxguide.nominal.pseudospectral import edges
 from jaxguide.nominal.refinement import moved
+from jaxguide.nominal.starting import edges
 from jaxguide.nominal.structure import _cut
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
 from jaxguide.problems import EarthMars

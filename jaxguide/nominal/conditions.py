@@ -26,13 +26,6 @@ class Unknowns(NamedTuple):
     tf: Float[Array, " chosen"]
 
 
-def number_of_constraints(problem: Problem) -> int:
-    """q, the number of endpoint constraints."""
-    x = jax.ShapeDtypeStruct((problem.n,), jnp.result_type(float))
-    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    return jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
-
-
 def horizon(problem: Problem, z: Unknowns) -> tuple[Array, Array]:
     """Initial and final time, chosen or given."""
     dtype = z.starts.dtype

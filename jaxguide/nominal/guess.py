@@ -14,11 +14,11 @@ from jaxguide.nominal.conditions import (
     boundary_residual,
     canonical_rates,
     horizon,
-    number_of_constraints,
 )
 from jaxguide.problem import (
     Problem,
     bounds_of,
+    endpoint_count,
     initial_values,
     initially_free,
     is_free,
@@ -68,7 +68,7 @@ def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any
     The costate is affine in nu, so least squares over the flight gives it and with it the right
     scale of every multiplier: nothing about the costates is guessed.
     """
-    n, m, q = problem.n, problem.m, number_of_constraints(problem)
+    n, m, q = problem.n, problem.m, endpoint_count(problem)
     k_u, k_t, k_x = jax.random.split(key, 3)
     lo, hi = bounds_of(problem.control_bounds, m, dtype)
     finite = jnp.isfinite(lo) & jnp.isfinite(hi)

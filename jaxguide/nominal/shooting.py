@@ -17,11 +17,17 @@ from jaxguide.nominal.conditions import (
     boundary_residual,
     canonical_rates,
     horizon,
-    number_of_constraints,
 )
 from jaxguide.nominal.control import minimising_control
 from jaxguide.nominal.guess import coarse_ends, damped_newton, objective, random_start
-from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free, start_value
+from jaxguide.problem import (
+    Problem,
+    bounds_of,
+    endpoint_count,
+    hamiltonian,
+    is_free,
+    start_value,
+)
 from jaxguide.spectral import nodes_lgl
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS, is_traced
@@ -101,7 +107,7 @@ class Shooting(eqx.Module):
                 f"{kind}.integrands: integral constraints are not for shooting; write each as a "
                 "state with an endpoint constraint."
             )
-        q = number_of_constraints(problem)
+        q = endpoint_count(problem)
         lo, hi = (np.broadcast_to(np.asarray(b), (q,)) for b in problem.endpoint_bounds)
         if np.any(lo != hi):
             i = int(np.argmax(lo != hi))
@@ -168,7 +174,7 @@ class Shooting(eqx.Module):
         x0 = random_start(problem, jax.random.key(0), 1, 1, dtype).starts[0, : problem.n]
         z = Unknowns(
             jnp.concatenate([x0, costate])[None],
-            jnp.zeros((number_of_constraints(problem),), dtype),
+            jnp.zeros((endpoint_count(problem),), dtype),
             pick(problem.initial_time, start_value(problem.initial_time)),
             pick(problem.final_time, start_value(problem.final_time)),
         )

@@ -15,6 +15,8 @@ from jaxguide.nominal.mesh import Collocation, collocation
 from jaxguide.problem import (
     Problem,
     bounds_of,
+    count,
+    endpoint_count,
     initial_values,
     initially_free,
     is_free,
@@ -124,7 +126,7 @@ class Transcription(eqx.Module):
     @property
     def sizes(self) -> Sizes:
         problem = self.problem
-        path, end = constraint_counts(problem)
+        path, end = count(problem, "path_constraints"), endpoint_count(problem)
         times = self.edges.shape[1]
         return Sizes(
             problem.n,
@@ -268,15 +270,6 @@ def hessian(f: Any, argnum: int) -> Any:
         return (h + h.T) / 2
 
     return symmetric
-
-
-def constraint_counts(problem: Problem) -> tuple[int, int]:
-    """Numbers of path and endpoint constraints."""
-    dtype = jnp.result_type(float)
-    t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
-    problem = with_parameters(problem, None)
-    path = jax.eval_shape(problem.path_constraints, t, x, u).shape[0]
-    return path, jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
 
 
 class Bounds(NamedTuple):

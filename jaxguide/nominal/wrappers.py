@@ -6,11 +6,10 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.problem import Free, Problem, bounds_of, is_free, with_parameters
+from jaxguide.problem import Free, Problem, bounds_of, count, endpoint_count, is_free
 from jaxguide.trajectory import Extremal, Multipliers
 
 
@@ -64,21 +63,6 @@ def initial_entries(problem: Problem) -> tuple[Any, ...]:
     if start is None or is_free(start):
         return (Free() if start is None else start,) * problem.n
     return tuple(start[i] for i in range(problem.n))
-
-
-def count(problem: Problem, name: str) -> int:
-    """Components of its path constraints or integrands."""
-    dtype = jnp.result_type(float)
-    t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
-    return jax.eval_shape(getattr(with_parameters(problem, None), name), t, x, u).shape[0]
-
-
-def endpoint_count(problem: Problem) -> int:
-    """Components of its endpoint constraints."""
-    dtype = jnp.result_type(float)
-    t, x = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((problem.n,), dtype)
-    problem = with_parameters(problem, None)
-    return jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
 
 
 def rewrapped(whole: Problem, problem: Problem) -> Problem:

@@ -1,0 +1,282 @@
+"""Where a direct solve starts: designer units, and guesses straight, random or from an extremal,
+multipliers included."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import solve as small_solve
+from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
+from jaxguide.problem import (
+    Problem,
+    bounds_of,
+    count,
+    endpoint_count,
+    initial_values,
+    initially_free,
+    is_free,
+    parameters,
+    start_control,
+    start_value,
+    with_parameters,
+)
+from jaxguide.trajectory import Extremal
+
+
+def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
+    """Break points as combinations of (t0, tf, knots): each between the two nearest of them."""
+    last = fractions.shape[0] - 1
+    main = np.array([0, *sorted(knots), last])
+    column = np.array([0, *range(2, 2 + len(knots)), 1])
+    j = np.arange(last + 1)
+    left = np.clip(np.searchsorted(main, j, side="right") - 1, 0, len(main) - 2)
+    a, b = fractions[main[left]], fractions[main[left + 1]]
+    share = (fractions - a) / (b - a)
+    out = jnp.zeros((last + 1, 2 + len(knots)), fractions.dtype)
+    return out.at[j, column[left]].add(1 - share).at[j, column[left + 1]].add(share)
+
+
+def unit_scale(problem: Problem, knots: int) -> Scale:
+    path, end = count(problem, "path_constraints"), endpoint_count(problem)
+    end += knots + 1 if knots else 0
+    one = jnp.ones((), jnp.result_type(float))
+    many = lambda k: jnp.ones(k, one.dtype)
+    return Scale(
+        many(problem.n), many(problem.m), one, many(len(parameters(problem))), many(path),
+        many(end), one,
+    )  # fmt: skip
+
+
+def horizon_guess(problem: Problem) -> tuple[Array, Array]:
+    """Times to start from: given, guessed, or one unit where nothing is said."""
+    dtype = jnp.result_type(float)
+    t0 = jnp.asarray(start_value(problem.initial_time), dtype)
+    tf = problem.final_time
+    if not is_free(tf) or tf.guess is not None:
+        return t0, jnp.asarray(start_value(tf), dtype)
+    lo, hi = jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype)
+    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    return t0, jnp.where(bounded, start_value(tf), jnp.clip(t0 + 1.0, lo, hi))
+
+
+def straight_guess(
+    program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...]
+) -> Primal:
+    """States on a straight line to the nearest ends that meet the endpoint constraints; controls
+    in the middle of their bounds. In user units."""
+    problem, size = with_parameters(program.problem, None), program.sizes
+    dtype, n = program.dtype, size.n
+    lo, hi = bounds_of(program.problem.state_bounds, n, dtype)
+    x0 = jnp.clip(initial_values(program.problem, dtype), lo, hi)
+    t0, tf = horizon_guess(program.problem)
+    q = size.end - len(program.order)
+    e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, q, dtype)
+    scale = jnp.tile(typical(lo, hi, x0[None]), 2)
+    # Free components of the initial state move with the final ones.
+    free = jnp.concatenate([jnp.asarray(initially_free(program.problem)), jnp.ones(n, bool)])
+    scale = jnp.where(free, scale, 0.0)
+    low, high = jnp.tile(lo, 2), jnp.tile(hi, 2)
+
+    def nearer(_: Any, ends: Array) -> Array:
+        def at(y: Array) -> Array:
+            moved = ends + y * scale
+            return problem.endpoint_constraints(moved[:n], moved[n:], t0, tf)
+
+        e, J = at(jnp.zeros_like(ends)), jax.jacfwd(at)(jnp.zeros_like(ends))
+        miss = e - jnp.clip(e, e_lo, e_hi)
+        gram = J @ J.T
+        ridge = 1e-8 * (jnp.trace(gram) + 1e-30) * jnp.eye(q, dtype=dtype)
+        step = J.T @ small_solve(gram + ridge, miss)
+        step = jnp.where(jnp.isfinite(step), step, 0.0)
+        return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
+
+    ends = jnp.tile(x0, 2)
+    ends = jax.lax.fori_loop(0, 8, nearer, ends) if q else ends
+    x0, xf = ends[:n], ends[n:]
+    u = start_control(program.problem, dtype)
+    s = fractions_at(fractions, program.rule.support[1:])
+    x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
+    u = jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
+    p = [start_value(v) for v in parameters(program.problem)]
+    times = placed(t0, tf, fractions, knots)
+    return without_slacks(program, x0, x, u, times, p)
+
+
+def is_key(guess: Any) -> bool:
+    """Whether `guess` is a random key: a random start."""
+    return isinstance(guess, jax.Array) and jnp.issubdtype(guess.dtype, jax.dtypes.prng_key)
+
+
+def random_guess(
+    program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...], key: Array
+) -> Primal:
+    """The straight guess, bent at random: states by two sine waves of a third of their size within
+    their bounds, controls on a line between two points of theirs, a free final time within a factor
+    of two. In user units."""
+    w = straight_guess(program, fractions, knots)
+    size, dtype, rule = program.sizes, program.dtype, program.rule
+    k_x, k_u, k_t = jax.random.split(key, 3)
+    lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
+    scale = typical(lo, hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
+    waves = jax.random.normal(k_x, (2, size.n), dtype) * scale[None] / 3
+    s = fractions_at(fractions, rule.support[1:])
+    bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
+    x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])
+    u_lo, u_hi = bounds_of(program.problem.control_bounds, size.m, dtype)
+    bounded = jnp.isfinite(u_lo) & jnp.isfinite(u_hi)
+    middle = jnp.where(bounded, (u_lo + u_hi) / 2, 0.0)
+    half = jnp.where(bounded, (u_hi - u_lo) / 2, 3.0)
+    ends = middle[None] + half[None] * jax.random.uniform(k_u, (2, size.m), dtype, -1.0, 1.0)
+    ends = jnp.clip(ends, u_lo[None], u_hi[None])
+    s = fractions_at(fractions, rule.nodes)[..., None]
+    u = ends[0][None, None] * (1 - s) + ends[1][None, None] * s
+    tf = program.problem.final_time
+    times = w.times
+    if is_free(tf):
+        span = (times[1] - times[0]) * 2 ** jax.random.uniform(k_t, (), dtype, -1.0, 1.0)
+        end = jnp.clip(times[0] + span, jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype))
+        times = placed(times[0], end, fractions, knots)
+    return w._replace(x=x, u=u, times=times)
+
+
+def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Float[Array, " k"]:
+    """t0, tf and the knots, at their fractions of the horizon."""
+    inner = t0 + (tf - t0) * fractions[np.array(sorted(knots), int)]
+    return jnp.concatenate([jnp.stack([t0, tf]), inner])
+
+
+def without_slacks(
+    program: Transcription, x0: Array, x: Array, u: Array, times: Array, p: list
+) -> Primal:
+    """A guess whose slacks are yet to be filled in."""
+    size, dtype = program.sizes, program.dtype
+    p_ = jnp.stack([jnp.asarray(v, dtype) for v in p]) if p else jnp.zeros(0, dtype)
+    path = jnp.zeros((size.segments, size.nodes, size.path), dtype)
+    return Primal(x0, x, u, times, p_, path, jnp.zeros(size.end, dtype))
+
+
+def fractions_at(fractions: Float[Array, " edge"], tau: np.ndarray) -> Float[Array, "segment k"]:
+    """Where in the horizon the points `tau` of every segment are."""
+    local = jnp.asarray((tau[None] + 1) / 2, fractions.dtype)
+    return fractions[:-1, None] + jnp.diff(fractions)[:, None] * local
+
+
+def from_extremal(
+    program: Transcription,
+    fractions: Float[Array, " edge"],
+    knots: tuple[int, ...],
+    problem: Problem,
+    guess: Extremal,
+) -> Primal:
+    """States and controls of `guess` at this mesh's times. In user units."""
+    size, rule, dtype = program.sizes, program.rule, program.dtype
+    t0, tf = guess.t[0], guess.t[-1]
+    at = lambda tau: t0 + (tf - t0) * fractions_at(fractions, tau)
+    fill = lambda y, k: jnp.concatenate(
+        [y, jnp.zeros((*y.shape[:-1], k - y.shape[-1]), dtype)], axis=-1
+    )
+    point = jax.vmap(jax.vmap(guess.point))
+    x = fill(point(at(rule.support[1:])).x, size.n)
+    u = fill(point(at(rule.nodes)).u, size.m)
+    p = [start_value(v) for v in parameters(guess.problem, like=problem)]
+    times = placed(t0, tf, fractions, knots)
+    return without_slacks(program, fill(guess.x[0], size.n), x, u, times, p)
+
+
+def blank_duals(program: Transcription, w: Primal) -> tuple[Rows, Primal]:
+    """No multipliers."""
+    size = program.sizes
+    defect = jnp.zeros((size.segments, program.rule.A.shape[0], size.n), program.dtype)
+    zeros = jax.tree_util.tree_map(jnp.zeros_like, w)
+    return Rows(defect, zeros.path, zeros.end), zeros
+
+
+def fits(program: Transcription, guess: Extremal) -> bool:
+    """Whether the covectors of `guess` are those of this problem's constraints."""
+    size, m = program.sizes, guess.multipliers
+    ends = m.endpoint.shape[0] + m.integral.shape[0]
+    return (
+        guess.costate.shape[1] + m.integral.shape[0] == size.n
+        and ends == size.end - len(program.order)
+        and m.path.shape[1] == size.path
+    )
+
+
+def duals(
+    program: Transcription, fractions: Float[Array, " edge"], w: Primal, guess: Extremal
+) -> dict[str, Any]:
+    """`costates` and the multipliers of `to_extremal` undone: those of `guess` on this mesh."""
+    size, rule, scale, dtype = program.sizes, program.rule, program.scale, program.dtype
+    t0, tf = guess.t[0], guess.t[-1]
+    times = t0 + (tf - t0) * fractions_at(fractions, np.append(rule.nodes, 1.0))
+    m, r = guess.multipliers, guess.multipliers.integral
+    costate = jax.vmap(jax.vmap(guess.point))(times).costate
+    # An integral's costate is its multiplier, all along.
+    constant = jnp.broadcast_to(r, (*costate.shape[:2], r.shape[0]))
+    lam = jnp.concatenate([costate, constant], axis=2) * (scale.x / scale.objective)[None, None]
+    weight = jnp.asarray(rule.w, dtype)[None, :, None]
+    nodal, end = lam[:, :-1], lam[:, -1:]
+    defect = -weight * nodal
+    if rule.A.shape[0] > size.nodes:  # LG: the last row is the quadrature to the end
+        defect = jnp.concatenate([-weight * (nodal - end), -end], axis=1)
+    spans = program.clocks @ w.times
+    clock = weight * ((spans[:, 1] - spans[:, 0]) / 2)[:, None, None] * scale.t / scale.objective
+    held = jnp.concatenate([m.path, m.state, m.control], axis=1)
+    held = jax.vmap(jax.vmap(lambda t: guess.interpolate(held, t)))(times[:, :-1])
+    path, state, control = jnp.split(held, np.cumsum([m.path.shape[1], m.state.shape[1]]), axis=2)
+    wide = lambda a, k: jnp.pad(a, ((0, 0), (0, 0), (0, k - a.shape[2])))
+    path = path * clock * scale.path[None, None]
+    end = jnp.concatenate([m.endpoint, r]) / scale.objective
+    end = jnp.pad(end, (0, size.end - end.shape[0])) * scale.end
+    on_states = jnp.zeros_like(w.x)
+    first = 1 - rule.first  # of the nodes, the first that follows the segment's start
+    state = wide(state, size.n) * clock * scale.x[None, None]
+    on_states = on_states.at[:, : size.nodes - first].set(state[:, first:])
+    zeros = jax.tree_util.tree_map(jnp.zeros_like, w)
+    net = zeros._replace(
+        x=on_states, u=wide(control, size.m) * clock * scale.u[None, None], path=path, end=end
+    )
+    return {"y": Rows(defect, path, end), "net": net}
+
+
+def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
+    """The larger finite bound; else the largest value seen; else 1."""
+    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
+    scale = jnp.where(bounded & (wide > 0), wide, jnp.max(jnp.abs(seen), axis=0))
+    return jnp.where(scale > 1e-8, scale, 1.0)
+
+
+def designer_units(program: Transcription, w: Primal) -> Scale:
+    """Scales from bounds and the guess; constraints and objective by their gradients there."""
+    problem, size, dtype = program.problem, program.sizes, program.dtype
+    x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
+    u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
+    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
+    u = typical(u_lo, u_hi, jnp.zeros((1, size.m), dtype))
+    t = jnp.maximum(w.times[1] - w.times[0], 1e-8)
+    p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)
+    scale = program.scale._replace(x=x, u=u, t=t, p=p)
+    program = eqx.tree_at(lambda q: q.scale, program, scale)
+    scaled = jax.tree_util.tree_map(jnp.divide, w, program.units)
+    nodes, ends = program.derivatives(scaled)
+    n = size.n
+    rows = jnp.max(jnp.abs(nodes.jacobian), axis=(0, 1, 3), initial=0.0)
+    usable = lambda a: jnp.where(jnp.isfinite(a) & (a > 1e-8), a, 1.0)
+    # The objective's gradient a unit away too: at rest it may vanish.
+    away = scaled._replace(x=scaled.x + 1.0, u=scaled.u + 1.0)
+    steeper, _ = program.derivatives(away)
+    weights = jnp.asarray(program.rule.w, dtype)[None, :, None]
+    largest = lambda a: jnp.max(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0))
+    cost = jnp.maximum(
+        largest(nodes.jacobian[:, :, n] / weights), largest(steeper.jacobian[:, :, n] / weights)
+    )
+    end_rows = jnp.max(jnp.abs(ends.jacobian), axis=1)
+    objective = usable(jnp.maximum(cost, end_rows[0]))
+    end = usable(end_rows[1:])
+    end = end.at[size.end - len(program.order) :].set(1.0)  # of the knots: in units of time
+    return scale._replace(path=usable(rows[n + 1 :]), end=end, objective=objective)
