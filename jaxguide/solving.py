@@ -161,7 +161,8 @@ def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
     if not isinstance(method, Pseudospectral):
         return _whole(method, problem, guess)
     # In two programs, so that the optimiser's serves every guess and every mesh of its size.
-    return _quick(finished)(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
+    run = _compiled(finished, method.quick)
+    return run(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
 
 
 @eqx.filter_jit
@@ -175,8 +176,8 @@ def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
 
 
 @functools.cache
-def _quick(function: Callable[..., Any]) -> Callable[..., Any]:
-    options: Any = {"compiler_options": quick_compilation() or None}
+def _compiled(function: Callable[..., Any], quick: bool) -> Callable[..., Any]:
+    options: Any = {"compiler_options": (quick and quick_compilation()) or None}
     return eqx.filter_jit(function, **options)
 
 

@@ -75,7 +75,7 @@ def stand_ins(monkeypatch):
     monkeypatch.setattr(doctor, "canary", lambda: 0)
     fakes = {
         jaxguide: {
-            "solve": lambda problem: extremal(),
+            "solve": lambda problem, watch=None: extremal(),
             "gain_schedule": gain_schedule,
             "simulate": flight,
             "sweep": sweep,

@@ -64,6 +64,8 @@ class Pseudospectral(eqx.Module):
       trace the mesh stays.
     - `log`: print the optimiser's iterations: objective, worst constraint, scaled error, barrier,
       regularisation, step; "r" marks restoration, "e" an estimate of the multipliers.
+    - `quick`: compile in half the time, for programs a fifth slower. False where a mesh is solved on
+      many times. Under a trace whoever compiles decides.
 
     **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
 
@@ -85,6 +87,7 @@ class Pseudospectral(eqx.Module):
     refinements: int = eqx.field(static=True, default=4)
     mesh_tolerance: float = eqx.field(static=True, default=1e-7)
     log: bool = eqx.field(static=True, default=False)
+    quick: bool = eqx.field(static=True, default=True)
     accuracy = 1e-6  # that its certificates ask for
 
     def __check_init__(self):

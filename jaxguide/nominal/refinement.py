@@ -179,7 +179,7 @@ def _meshed(
     return Pseudospectral(
         method.grid, nodes, len(fractions) - 1, fractions, knots, arcwise, method.relaxation,
         method.time_scale, 1, method.seed, method.tolerance, method.max_iterations,
-        method.refinements, method.mesh_tolerance,
+        method.refinements, method.mesh_tolerance, method.log, method.quick,
     )  # fmt: skip
 
 
