@@ -157,7 +157,7 @@ def test_reproduction_out_of_tolerance_exits_with_1(monkeypatch, capfd, computed
 
 
 def test_failed_certificate_flight_and_check_exit_with_1(monkeypatch, capfd):
-    monkeypatch.setattr(jaxguide, "solve", lambda problem: extremal(ok=False))
+    monkeypatch.setattr(jaxguide, "solve", lambda problem, watch=None: extremal(ok=False))
     assert cli.run(["solve", "earth-mars"]) == 1
     monkeypatch.setattr(problems, "mission", lambda name: "bad")
     assert cli.run(["fly", "earth-mars"]) == 1
@@ -188,7 +188,7 @@ def test_wrong_words_end_in_one_line_with_the_right_ones(line, hint, capfd):
 
 
 def test_library_error_is_its_message(monkeypatch, capfd):
-    def unsolved(problem):
+    def unsolved(problem, watch=None):
         raise RuntimeError("the end is out of reach")
 
     monkeypatch.setattr(jaxguide, "solve", unsolved)
