@@ -11,9 +11,8 @@ from jaxguide.spectral import legendre_matrix
 from jaxguide.trajectory import Extremal
 
 _NEAR = 1e-4  # of a constraint's range: as near as this it is active
-# What an arc holds at least, else it is the blur of a junction: nodes, and either more of them or a
-# share of the horizon.
-_LEAST, _MANY, _SHARE = 2, 12, 2e-3
+# What an arc holds at least, else it is the blur of a junction: nodes, and a share of the horizon.
+_LEAST, _SHARE = 2, 2e-3
 
 
 class Arcs(NamedTuple):
@@ -77,10 +76,9 @@ def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
     return Arcs(np.array(junctions), np.array(active), names)
 
 
-def _lasts(t: np.ndarray, a: Any, b: Any) -> bool:
+def _lasts(t: np.ndarray, a: Any, b: Any) -> Any:
     """Whether nodes a ... b - 1 are an arc."""
-    long = t[b - 1] - t[a] >= _SHARE * (t[-1] - t[0])
-    return bool(b - a >= _MANY or (b - a >= _LEAST and long))
+    return b - a >= _LEAST and bool(t[b - 1] - t[a] >= _SHARE * (t[-1] - t[0]))
 
 
 def _calmed(t: np.ndarray, labels: np.ndarray) -> np.ndarray:
