@@ -15,7 +15,7 @@ from jaxguide.nominal import kkt
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
 from jaxguide.nominal.refinement import moved
 from jaxguide.nominal.starting import edges
-from jaxguide.nominal.structure import _cut
+from jaxguide.nominal.structure import Arcs, _cut, without_collapsed
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
 from jaxguide.problems import EarthMars
 
@@ -382,6 +382,15 @@ def test_arcs_of_labels():
     found = _cut(t, labels, ("u",))
     assert found.active.ravel().tolist() == [-1, 1]
     np.testing.assert_allclose(found.junctions, 0.3, atol=1 / 39)
+
+
+def test_arcs_that_free_knots_closed_are_dropped():
+    found = Arcs(np.array([0.5, 0.6, 0.8]), np.array([[-1], [0], [1], [0]]), ("u",))
+    kept = without_collapsed(found, np.array([0.0, 0.55, 0.5501, 0.8, 1.0]))
+    assert kept.active.ravel().tolist() == [-1, 1, 0]
+    np.testing.assert_allclose(kept.junctions, [0.55005, 0.8])
+    alike = Arcs(found.junctions[:2], np.array([[-1], [0], [-1]]), ("u",))
+    assert len(without_collapsed(alike, np.array([0.0, 0.55, 0.5501, 1.0])).junctions) == 0
 
 
 def test_random_starts_are_extremals_or_reasons():

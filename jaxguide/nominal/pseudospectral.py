@@ -64,8 +64,8 @@ class Pseudospectral(eqx.Module):
       trace the mesh stays.
     - `log`: print the optimiser's iterations: objective, worst constraint, scaled error, barrier,
       regularisation, step; "r" marks restoration, "e" an estimate of the multipliers.
-    - `quick`: compile in half the time, for programs a fifth slower. False where a mesh is solved on
-      many times. Under a trace whoever compiles decides.
+    - `quick`: compile in half the time, for programs a fifth slower. False where one mesh is solved
+      on many times. Under a trace whoever compiles decides.
 
     **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
 

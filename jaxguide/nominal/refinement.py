@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.nominal.pseudospectral import Pseudospectral
-from jaxguide.nominal.structure import Arcs, arcs
+from jaxguide.nominal.structure import Arcs, arcs, without_collapsed
 from jaxguide.nominal.transcription import Arcwise
 from jaxguide.nominal.wrappers import Endless
 from jaxguide.problem import Problem, hamiltonian
@@ -202,7 +202,8 @@ def structured(
     affine = _affine(extremal)
     t0, tf = float(extremal.t[0]), float(extremal.t[-1])
     main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
-    breaks, knots, held, smooth, released, unpathed = [0.0], [], [], [], [], []
+    breaks, knots, edges = [0.0], [], [0]
+    held, smooth, released, unpathed = [], [], [], []
     for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
         # A singular arc gets one polynomial: more would let its control chatter.
         singular = affine & (found.active[arc, :m] == 0)
@@ -218,11 +219,12 @@ def structured(
             released[-1] = released[-1] | np.stack([np.zeros(n, bool), implied])
         released += [np.stack([implied, implied])] * count
         released[-1] = np.stack([implied, np.zeros(n, bool)])
+        edges.append(len(breaks) - 1)
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
     known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released, unpathed)))
-    asked = method.tolerance
+    original, asked = method, method.tolerance
     method = dataclasses.replace(method, tolerance=min(asked, _EXACT))
     knotted = _meshed(method, np.array(breaks), _KNOTTED_NODES, tuple(knots), known)
     exact = run(knotted, problem, extremal)
@@ -231,6 +233,9 @@ def structured(
         exact = run(knotted, problem, exact)
     error = float(jnp.max(segment_errors(exact)))
     watch(Progress("free knots", exact, error))
+    kept = without_collapsed(found, np.asarray(exact.breaks)[np.array(edges)])
+    if exact.result == RESULTS.successful and 0 < len(kept.junctions) < len(junctions):
+        return structured(run, original, problem, exact, kept, watch)
     if exact.result != RESULTS.successful or error > method.mesh_tolerance:
         return exact, np.inf
     # A wrong structure shows in multipliers of the wrong sign, or bounds left between nodes.

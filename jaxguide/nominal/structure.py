@@ -10,7 +10,9 @@ from jaxguide.problem import bounds_of
 from jaxguide.spectral import legendre_matrix
 from jaxguide.trajectory import Extremal
 
-_NEAR = 1e-4  # of a constraint's range: as near as this it is active
+# As near to a bound as this, of its range, it is active; controls are let off lightly, where short
+# segments give their multipliers little weight.
+_NEAR, _NEAR_CONTROL = 1e-4, 1e-2
 # What an arc holds at least, else it is the blur of a junction: nodes, and a share of the horizon.
 _LEAST, _SHARE = 2, 2e-3
 
@@ -42,12 +44,27 @@ def arcs(extremal: Extremal) -> Arcs:
     ):
         lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
         span = np.minimum(hi - lo, np.ptp(values, axis=0) + 1e-12)
-        at = np.where(values - lo <= _NEAR * span, -1, 0) + np.where(
-            hi - values <= _NEAR * span, 1, 0
-        )
+        near = span * (_NEAR_CONTROL if kinds is problem.control_names else _NEAR)
+        at = np.where(values - lo <= near, -1, 0) + np.where(hi - values <= near, 1, 0)
         labels.append(at)
         names += [prefix + k for k in kinds]
     return _cut(t, np.concatenate(labels, axis=1), tuple(names))
+
+
+def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
+    """`found` with its arcs at `edges` (ends included), but for those that free knots closed."""
+    long = np.diff(edges) >= _SHARE * (edges[-1] - edges[0])
+    keep = np.flatnonzero(long)
+    # Alike once what stood between them is gone: one arc.
+    same = [np.array_equal(found.active[a], found.active[b]) for a, b in zip(keep, keep[1:])]
+    first = keep[np.append(True, ~np.array(same, bool))]
+    middle = [(edges[a] + edges[b + 1]) / 2 for a, b in zip(first[1:], _before(keep, first))]
+    return Arcs(np.array(middle), found.active[first], found.names)
+
+
+def _before(keep: np.ndarray, first: np.ndarray) -> list[int]:
+    """The last arc that lasts ahead of each but the first of `first`."""
+    return [int(keep[np.searchsorted(keep, k) - 1]) for k in first[1:]]
 
 
 @jax.jit
