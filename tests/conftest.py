@@ -13,7 +13,7 @@ import jax
 import matplotlib
 
 # Compiles in half the time, for code a fifth slower: tests compile for minutes and run for seconds.
-# Slow tests, benchmarks and the commands that tests start go without.
+# Benchmarks and the commands that tests start go without.
 _QUICK = "--xla_cpu_use_fusion_emitters=false"
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_QUICK}".strip()
 jax.devices()
