@@ -379,17 +379,17 @@ def test_arcs_of_labels():
     t = np.linspace(0, 1, 40)
     labels = np.where(t < 0.3, -1, 1)[:, None]
     labels[20] = 0  # the blur of a node
-    found = _cut(t, labels, ("u",))
+    found = _cut(t, labels)
     assert found.active.ravel().tolist() == [-1, 1]
     np.testing.assert_allclose(found.junctions, 0.3, atol=1 / 39)
 
 
 def test_arcs_that_free_knots_closed_are_dropped():
-    found = Arcs(np.array([0.5, 0.6, 0.8]), np.array([[-1], [0], [1], [0]]), ("u",))
+    found = Arcs(np.array([0.5, 0.6, 0.8]), np.array([[-1], [0], [1], [0]]))
     kept = without_collapsed(found, np.array([0.0, 0.55, 0.5501, 0.8, 1.0]))
     assert kept.active.ravel().tolist() == [-1, 1, 0]
     np.testing.assert_allclose(kept.junctions, [0.55005, 0.8])
-    alike = Arcs(found.junctions[:2], np.array([[-1], [0], [-1]]), ("u",))
+    alike = Arcs(found.junctions[:2], np.array([[-1], [0], [-1]]))
     assert len(without_collapsed(alike, np.array([0.0, 0.55, 0.5501, 1.0])).junctions) == 0
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxguide.nominal import kkt
+from jaxguide.nominal.log import report
 from jaxguide.nominal.transcription import (
     Bounds,
     Primal,
@@ -488,21 +489,9 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)
     if program.log:
         numbers = (s.k, f, _largest(c), error_now, mu, delta, jnp.where(accepted, alpha, 0.0))
-        jax.debug.callback(_report, s.mode, program.scale.objective, *numbers)
+        jax.debug.callback(report, s.mode, program.scale.objective, *numbers)
     return _State(
         new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
         jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
         s.k + 1, status.astype(s.status.dtype), error_now, free, errors,
     )  # fmt: skip
-
-
-def _report(mode: Any, unit: Any, k: Any, f: Any, c: Any, error: Any, *rest: Any) -> None:
-    """One line of the iteration log; objective in the user's units."""
-    if k == 0:
-        print("iter  objective        violation  error      mu       delta    step")
-    kind = " re"[int(mode)]
-    mu, delta, alpha = (float(v) for v in rest)
-    print(
-        f"{int(k):4d}{kind} {float(f) * float(unit):+.9e} {float(c):.2e}   {float(error):.2e}   "
-        f"{mu:.1e}  {delta:.1e}  {alpha:.2g}"
-    )

@@ -151,8 +151,8 @@ class Pseudospectral(eqx.Module):
             )
 
     def memory(self, problem: Problem) -> float:
-        """Bytes of a Newton step, roughly: a segment's orthonormal basis, the directions that its
-        nodes' inputs take, and a few copies."""
+        """Bytes of a Newton step, roughly: a segment's factors, the directions that its nodes'
+        inputs take, and a few copies."""
         segments = self.segments if self.fractions is None else len(self.fractions) - 1
         n, m, C = problem.n, problem.m, float(self.nodes)
         basis = (C + 1) * n + C * m

@@ -23,7 +23,6 @@ class Arcs(NamedTuple):
 
     junctions: Float[np.ndarray, " junction"]
     active: Float[np.ndarray, "arc component"]
-    names: tuple[str, ...]
 
 
 def arcs(extremal: Extremal) -> Arcs:
@@ -36,19 +35,18 @@ def arcs(extremal: Extremal) -> Arcs:
     flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
     t, x, u = flat(t), flat(x), flat(u)
     h = np.asarray(jax.vmap(problem.path_constraints)(t, x, u))
-    labels, names = [], []
-    for prefix, kinds, values, bounds in (
-        ("", problem.control_names, u, problem.control_bounds),
-        ("", problem.state_names, x, problem.state_bounds),
-        ("path ", tuple(map(str, range(h.shape[1]))), h, problem.path_bounds),
+    labels = []
+    for values, bounds, share in (
+        (u, problem.control_bounds, _NEAR_CONTROL),
+        (x, problem.state_bounds, _NEAR),
+        (h, problem.path_bounds, _NEAR),
     ):
         lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
         span = np.minimum(hi - lo, np.ptp(values, axis=0) + 1e-12)
-        near = span * (_NEAR_CONTROL if kinds is problem.control_names else _NEAR)
+        near = share * span
         at = np.where(values - lo <= near, -1, 0) + np.where(hi - values <= near, 1, 0)
         labels.append(at)
-        names += [prefix + k for k in kinds]
-    return _cut(t, np.concatenate(labels, axis=1), tuple(names))
+    return _cut(t, np.concatenate(labels, axis=1))
 
 
 def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
@@ -59,7 +57,7 @@ def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
     same = [np.array_equal(found.active[a], found.active[b]) for a, b in zip(keep, keep[1:])]
     first = keep[np.append(True, ~np.array(same, bool))]
     middle = [(edges[a] + edges[b + 1]) / 2 for a, b in zip(first[1:], _before(keep, first))]
-    return Arcs(np.array(middle), found.active[first], found.names)
+    return Arcs(np.array(middle), found.active[first])
 
 
 def _before(keep: np.ndarray, first: np.ndarray) -> list[int]:
@@ -76,7 +74,7 @@ def _by_segment(extremal: Extremal):
     )
 
 
-def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
+def _cut(t: np.ndarray, labels: np.ndarray) -> Arcs:
     """Runs of equal labels; short ones are shared out between their neighbours."""
     labels = np.stack([_calmed(t, column) for column in labels.T], axis=1)
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.any(np.diff(labels, axis=0), axis=1))])
@@ -90,7 +88,7 @@ def _cut(t: np.ndarray, labels: np.ndarray, names: tuple[str, ...]) -> Arcs:
             merged.append((a, b))
     junctions = [(t[b - 1] + t[a]) / 2 for (_, b), (a, _) in zip(merged, merged[1:], strict=False)]
     active = [labels[a] for a, _ in merged]
-    return Arcs(np.array(junctions), np.array(active), names)
+    return Arcs(np.array(junctions), np.array(active))
 
 
 def _lasts(t: np.ndarray, a: Any, b: Any) -> Any:
