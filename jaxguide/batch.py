@@ -10,11 +10,13 @@ import numpy as np
 from jaxguide.montecarlo.sweep import over_cores
 from jaxguide.problem import Problem, with_array_leaves
 from jaxguide.progress import Progress
-from jaxguide.solving import chosen, on_fixed_mesh, solve
+from jaxguide.solving import chosen, compiled, on_fixed_mesh, solve
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
 _tree = jax.tree_util.tree_map
+
+CHUNK = 16  # lanes that one thread solves in one call of the program: dispatch costs as one lane
 
 
 def solve_batch(
@@ -27,8 +29,8 @@ def solve_batch(
 ) -> Extremal:
     """Solves each of `problems` on the method's fixed mesh; one batched Extremal.
 
-    Every lane runs the program that `solve` runs, in whichever of the host threads is idle: no
-    lane waits for another, and a lane is what its own `solve` without refinement would be.
+    Chunks of lanes go to whichever of the host threads is idle, and a lane is what its own `solve`
+    without refinement would be, to rounding.
 
     **Arguments:**
 
@@ -55,13 +57,22 @@ def solve_batch(
     if is_traced((batch, guess)):
         one = lambda p, g: solve(p, method, g, throw=False)
         return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)
-    # On the host, so that taking a lane costs no dispatch.
+    # On the host, so that taking a chunk costs no dispatch.
     batch, guess = jax.device_get((batch, guess))
-    run = on_fixed_mesh(first, method)
-    work = lambda i: jax.device_get(run(lane(batch, i), lane(guess, i) if own else guess))
+    one = on_fixed_mesh(first, method)
+
+    def chunk(k: int) -> Extremal:
+        at = np.arange(k * CHUNK, min((k + 1) * CHUNK, count))
+        padded = np.pad(at, (0, CHUNK - len(at)), mode="edge")
+        own_or_shared = lane(guess, padded) if own else guess
+        program = compiled(_lanes_of, getattr(method, "quick", False))
+        done = program(one, lane(batch, padded), own_or_shared, jnp.asarray(len(at)), own)
+        return _tree(lambda a: a[: len(at)], jax.device_get(done))
+
     # The first alone: it compiles.
-    lanes = [work(0), *over_cores(lambda i: work(i + 1), count - 1, progress, workers)]
-    out = _tree(lambda *a: jnp.asarray(np.stack(a)), *lanes)
+    chunks = -(-count // CHUNK)
+    parts = [chunk(0), *over_cores(lambda k: chunk(k + 1), chunks - 1, progress, workers)]
+    out = _tree(lambda *a: jnp.asarray(np.concatenate(a)), *parts)
     failed = np.flatnonzero(np.asarray(out.result != RESULTS.successful))
     if throw and failed.size:
         raise SolveError(
@@ -70,6 +81,16 @@ def solve_batch(
             "throw=False and look at .result."
         )
     return out
+
+
+def _lanes_of(one: Any, problems: Problem, guess: Any, count: Any, own: bool) -> Extremal:
+    """The first `count` lanes, one after another; the others stay blank."""
+    lane = lambda tree, i: _tree(lambda a: a[i], tree)
+    at = lambda i: one(lane(problems, i), lane(guess, i) if own else guess)
+    blank = jax.eval_shape(at, 0)
+    blank = _tree(lambda a: jnp.zeros((CHUNK, *a.shape), a.dtype), blank)
+    put = lambda i, out: _tree(lambda all, new: all.at[i].set(new), out, at(i))
+    return jax.lax.fori_loop(0, count, put, blank)
 
 
 def _stacked(problems: Sequence[Problem]) -> Problem:

@@ -56,14 +56,11 @@ def solve(
     direct = isinstance(method, Pseudospectral)
     without_end = direct and is_endless(problem)
     problem = with_array_leaves(problem)
+    if is_traced((problem, guess)):
+        return _traced(method, without_end, problem, guess)
     if without_end:
         problem = endless(problem, method.time_scale)
-        guess = (
-            closed(guess) if isinstance(guess, Extremal) and guess.stretch is not None else guess
-        )
-    if is_traced((problem, guess)):
-        extremal = method(problem, guess, certifier(method.accuracy))
-        return opened(extremal) if without_end else extremal
+        guess = closed(guess) if _is_opened(guess) else guess
     extremal = _best(method, problem, guess) if direct else _run(method, problem, guess)
     if direct and method.refinements:
         extremal = refined(_run, method, problem, extremal, watch or (lambda _: None))
@@ -97,16 +94,25 @@ def chosen(problem: Problem) -> Any:
 
 
 def on_fixed_mesh(problem: Problem, method: Any) -> Callable[[Problem, Any], Extremal]:
-    """What `solve` runs, without refinement or throwing, for problems of this one's structure,
-    which is checked here."""
+    """What `solve` does under a trace, pure, for problems of this one's structure, which is checked
+    here."""
     method.check_fields(problem)
     validate(problem)
     method.check(problem)
-    if not (isinstance(method, Pseudospectral) and is_endless(problem)):
-        return lambda problem, guess: _run(method, problem, guess)
-    return lambda problem, guess: opened(
-        _run(method, endless(problem, method.time_scale), closed(guess) if guess else None)
-    )
+    without_end = isinstance(method, Pseudospectral) and is_endless(problem)
+    return jax.tree_util.Partial(_traced, method, without_end)
+
+
+def _traced(method: Any, without_end: bool, problem: Problem, guess: Any) -> Extremal:
+    if without_end:
+        problem = endless(problem, method.time_scale)
+        guess = closed(guess) if _is_opened(guess) else guess
+    extremal = method(problem, guess, certifier(method.accuracy))
+    return opened(extremal) if without_end else extremal
+
+
+def _is_opened(guess: Any) -> bool:
+    return isinstance(guess, Extremal) and guess.stretch is not None
 
 
 def is_endless(problem: Problem) -> bool:
@@ -161,7 +167,7 @@ def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
     if not isinstance(method, Pseudospectral):
         return _whole(method, problem, guess)
     # In two programs, so that the optimiser's serves every guess and every mesh of its size.
-    run = _compiled(finished, method.quick)
+    run = compiled(finished, method.quick)
     return run(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
 
 
@@ -176,7 +182,8 @@ def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
 
 
 @functools.cache
-def _compiled(function: Callable[..., Any], quick: bool) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], quick: bool) -> Callable[..., Any]:
+    """`function` jitted, once for each way to compile it."""
     options: Any = {"compiler_options": (quick and quick_compilation()) or None}
     return eqx.filter_jit(function, **options)
 

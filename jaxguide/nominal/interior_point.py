@@ -20,6 +20,8 @@ from jaxguide.nominal import kkt
 from jaxguide.nominal.log import report
 from jaxguide.nominal.transcription import (
     Bounds,
+    Ends,
+    Nodes,
     Primal,
     Rows,
     Transcription,
@@ -298,16 +300,47 @@ def minimise(program: Transcription, bounds: Bounds, start: Start, options: Opti
 
 
 def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
-    """One step of any kind."""
-    newton, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
+    """One step of any kind, unless none is needed any more."""
+    at = _evaluated(program, box, s)
+    now = at.error(jnp.zeros_like(s.mu))
+    done = (s.mode == _NEWTON) & (now <= options.tolerance)
+    ended = s._replace(status=s.status * 0 + CONVERGED, k=s.k + 1, error=now)
+    none = jnp.zeros_like(s.mu)
+    new, delta, alpha = jax.lax.cond(
+        done, lambda: (ended, none, none), lambda: _step(program, box, options, s, at, now)
+    )
+    if program.log:
+        numbers = (s.k, at.f, _largest(at.c), now, new.mu, delta, alpha)
+        jax.debug.callback(report, s.mode, program.scale.objective, *numbers)
+    return new
+
+
+class _Here(NamedTuple):
+    """What is known of an iterate before anything is factorised."""
+
+    nodes: Nodes
+    ends: Ends
+    f: Array
+    c: Rows
+    low: Primal
+    high: Primal
+    error: Callable[[Array], Array]
+
+
+def _evaluated(program: Transcription, box: _Box, s: _State) -> _Here:
     nodes, ends = program.derivatives(s.w)
     f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
-    low, high = distances(box, s.w)
     lagrangian = kkt.gradient(program, nodes, ends, s.w, s.y)
     error = optimality_error(box, lagrangian, s.w, s.y, s.zl, s.zu, c)
-    error_now = error(jnp.zeros_like(s.mu))
-    done = newton & (error_now <= options.tolerance)
+    return _Here(nodes, ends, f, c, *distances(box, s.w), error)
 
+
+def _step(
+    program: Transcription, box: _Box, options: Options, s: _State, at: _Here, error_now: Array
+) -> tuple[_State, Array, Array]:
+    """A step of the kind `s.mode`; its regularisation and length."""
+    newton, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
+    nodes, ends, f, c, low, high, error = at
     gap = complementarity(box, low, high, s.zl, s.zu)
 
     # The system of this kind of step: Newton's; nearest to feasible; multipliers alone.
@@ -350,8 +383,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
     ready = lambda mu: newton & ~free & (error(mu) <= _KAPPA_EPS * mu) & (mu > least)
     mu = jax.lax.while_loop(ready, lower, held)
-    probing = free & ~done
-    tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(probing, error_now, mu))
+    tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(free, error_now, mu))
     # What was refused under another barrier says nothing of this one.
     filter_of = lambda mu: s.filter._replace(used=jnp.where(mu != s.mu, 0, s.filter.used))
 
@@ -426,7 +458,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
         ok = ok & _finite(step) & ~probe
         mu = jnp.where(probe & regular & _finite(step), probed(step), mu)
         worse = (theta_new >= theta) & jnp.isfinite(theta_new)
-        again = probe | ((k == 0) & newton & regular & ~ok & ~done & worse)
+        again = probe | ((k == 0) & newton & regular & ~ok & worse)
         corrected = _tree(lambda a, b: length * a + b, c, c_new)
         target = _where(probe, target, corrected)
         return k + 1, mu, target, first, (step, length), ok, f_type, again
@@ -435,7 +467,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     none = (kkt.Step(zeros, _tree(jnp.zeros_like, s.y)), jnp.ones_like(s.mu))
     no, yes = jnp.array(False), jnp.array(True)
     _, mu, _, (step, longest), latest, full, f_type, _ = jax.lax.while_loop(
-        lambda a: a[-1], aim, (jnp.where(probing, -1, 0), mu, target, none, none, no, no, yes)
+        lambda a: a[-1], aim, (jnp.where(free, -1, 0), mu, target, none, none, no, no, yes)
     )
     regular, filter = regular & _finite(step), filter_of(mu)
     slope = slope_of(mu, step.primal)
@@ -448,9 +480,9 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     alpha, found, f_type, _ = jax.lax.while_loop(
         lambda a: ~a[1] & (a[3] < _HALVINGS),
         shorten,
-        (longest, full | estimate | done | ~regular, f_type, 0),
+        (longest, full | estimate | ~regular, f_type, 0),
     )
-    accepted = regular & found & ~estimate & ~done
+    accepted = regular & found & ~estimate
     moved, alpha = _where(full, latest, (step, alpha))
     d = moved.primal
 
@@ -472,26 +504,24 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     new_zl, new_zu = _where(accepted, (zl, zu), (s.zl, s.zu))
 
     # What comes next.
-    f_at, c_at = program.objective_and_residual(new_w)
+    evaluate = lambda: program.objective_and_residual(new_w)
+    f_at, c_at = jax.lax.cond(restore, evaluate, lambda: (f, c))  # asked after restoration alone
     theta_at = _norm1(c_at)
     phi_at = f_at + _barrier(box, new_w, mu)
     home = (theta_at <= 0.9 * s.theta_entry) & _acceptable(filter, theta_at, phi_at)
     home = accepted & restore & (home | (_largest(c_at) <= options.tolerance / 10))
-    failed = ~accepted & ~estimate & ~done
+    failed = ~accepted & ~estimate
     into, stuck = failed & newton, failed & restore
     feasible = _largest(c) <= jnp.maximum(1e-8, options.tolerance)
     mode = jnp.where((restore & ~home) | into, _RESTORE, _NEWTON)
     mode = jnp.where(home, _ESTIMATE, mode)
     filter = _augment(filter, theta, f + mu * logs, (accepted & newton & ~f_type) | into)
-    status = jnp.where(done, CONVERGED, RUNNING)
-    status = jnp.where(stuck, jnp.where(feasible, STALLED, INFEASIBLE), status)
+    status = jnp.where(stuck, jnp.where(feasible, STALLED, INFEASIBLE), RUNNING)
     status = jnp.where(into & feasible, STALLED, status)
     status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)
-    if program.log:
-        numbers = (s.k, f, _largest(c), error_now, mu, delta, jnp.where(accepted, alpha, 0.0))
-        jax.debug.callback(report, s.mode, program.scale.objective, *numbers)
-    return _State(
+    new = _State(
         new_w, new_y, new_zl, new_zu, mu, filter, s.theta_max, s.theta_min,
         jnp.where(into, theta, s.theta_entry), delta_last, mode.astype(s.mode.dtype),
         s.k + 1, status.astype(s.status.dtype), error_now, free, errors,
     )  # fmt: skip
+    return new, delta, jnp.where(accepted, alpha, 0.0)

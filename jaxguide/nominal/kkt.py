@@ -121,7 +121,8 @@ def eliminate(program: Transcription, system: System) -> Segments:
         start, G = G[:, :, 0].reshape(count, n), G[:, :, 1:].reshape(count, -1)
         G = jnp.concatenate([G, to_u], axis=1) / weight[None]
         lu, _, order = jax.lax.linalg.lu(G.T)
-        basis, place = lu[:count], jnp.argsort(order)
+        basis = lu[:count]
+        place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
         free = -solve_triangular(basis, lu[count:].T, trans=1, lower=True, unit_diagonal=True)
         follow = -_basic(basis, jnp.concatenate([start, to_clock], axis=1))
         one = jnp.eye(free.shape[1], dtype=dtype)
