@@ -462,5 +462,7 @@ def test_bellman_segments_do_not_add_up_errors():
         end = problem.endpoint_constraints(b.x[0], b.x[-1], b.t[0], b.t[-1])
         return float(jnp.max(jnp.abs(end)))
 
-    # What remains is half as long, so its interpolation error a 2^5th of that of the whole.
-    assert 1e-10 < miss(2) < miss(1) / 8
+    # What remains is half as long, so its interpolation error a 2^5th of that of the whole, which
+    # is well above that of the solver.
+    whole = miss(1)
+    assert whole > 1e-8 and miss(2) < whole / 8

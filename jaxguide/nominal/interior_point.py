@@ -10,7 +10,7 @@ adaptive barrier: Nocedal, Waechter & Waltz, SIAM J. Optim. 19 (2009), Mehrotra'
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,11 @@ from jaxguide.nominal.transcription import (
     Primal,
     Rows,
     Transcription,
+    flattened,
 )
 
 _tree = jax.tree_util.tree_map
+Entries: TypeAlias = Any  # one number an unknown: a Primal, or all of them as one vector
 
 # Constants of the paper, section 3.
 _KAPPA_EPS, _KAPPA_MU, _THETA_MU, _TAU_MIN = 10.0, 0.2, 1.5, 0.99
@@ -88,10 +90,12 @@ class _Filter(NamedTuple):
 
 
 class _State(NamedTuple):
-    w: Primal
+    """Unknowns and bounds' multipliers as vectors: a leaf costs as much as all of them."""
+
+    w: Array
     y: Rows
-    zl: Primal
-    zu: Primal
+    zl: Array
+    zu: Array
     mu: Array
     filter: _Filter
     theta_max: Array
@@ -109,11 +113,11 @@ class _State(NamedTuple):
 class _Box(NamedTuple):
     """Bounds with what follows from them."""
 
-    lo: Primal
-    hi: Primal
-    below: Primal  # bool: has a lower bound and may move
-    above: Primal
-    given: Primal
+    lo: Entries
+    hi: Entries
+    below: Entries  # bool: has a lower bound and may move
+    above: Entries
+    given: Entries
 
 
 def boxed(bounds: Bounds) -> _Box:
@@ -129,7 +133,7 @@ def boxed(bounds: Bounds) -> _Box:
     return _Box(lo, hi, below, above, given)
 
 
-def inside(box: _Box, w: Primal, push: Any) -> Primal:
+def inside(box: _Box, w: Entries, push: Any) -> Entries:
     """`w` moved well within its bounds, given entries put where they belong (section 3.6)."""
 
     def one(w: Array, lo: Array, hi: Array, below: Array, above: Array, given: Array) -> Array:
@@ -142,7 +146,7 @@ def inside(box: _Box, w: Primal, push: Any) -> Primal:
     return _tree(one, w, box.lo, box.hi, box.below, box.above, box.given)
 
 
-def distances(box: _Box, w: Primal) -> tuple[Primal, Primal]:
+def distances(box: _Box, w: Entries) -> tuple[Entries, Entries]:
     """Distances to the bounds, 1 where there is none."""
     low = _tree(
         lambda w, b, on: jnp.where(on, w - jnp.where(on, b, 0.0), 1.0), w, box.lo, box.below
@@ -174,7 +178,7 @@ def _count(tree: Any) -> int:
     return sum(a.size for a in jax.tree_util.tree_leaves(tree))
 
 
-def complementarity(box: _Box, low: Primal, high: Primal, zl: Primal, zu: Primal) -> Array:
+def complementarity(box: _Box, low: Entries, high: Entries, zl: Entries, zu: Entries) -> Array:
     """Mean of distance times multiplier over all bounds; 0 where there is none."""
     both = _tree(lambda a, b, x, y: a * x + b * y, low, high, zl, zu)
     count = _total(
@@ -183,7 +187,7 @@ def complementarity(box: _Box, low: Primal, high: Primal, zl: Primal, zu: Primal
     return _total(both) / jnp.maximum(count, 1.0)
 
 
-def _barrier(box: _Box, w: Primal, mu: Array) -> Array:
+def _barrier(box: _Box, w: Entries, mu: Array) -> Array:
     """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
     low, high = distances(box, w)
     log = lambda a: jnp.log(jnp.where(a > 0, a, jnp.nan))
@@ -192,7 +196,7 @@ def _barrier(box: _Box, w: Primal, mu: Array) -> Array:
     return mu * (_total(_tree(one, low, high, box.below, box.above)) - logs)
 
 
-def barrier_gradient(box: _Box, low: Primal, high: Primal, mu: Array) -> Primal:
+def barrier_gradient(box: _Box, low: Entries, high: Entries, mu: Array) -> Entries:
     """Gradient of `_barrier`."""
 
     def one(a: Array, b: Array, l: Array, h: Array) -> Array:
@@ -203,7 +207,7 @@ def barrier_gradient(box: _Box, low: Primal, high: Primal, mu: Array) -> Primal:
     return _tree(one, low, high, box.below, box.above)
 
 
-def _longest(gap_low: Primal, gap_high: Primal, dw: Primal, box: _Box, tau: Array) -> Array:
+def _longest(gap_low: Entries, gap_high: Entries, dw: Entries, box: _Box, tau: Array) -> Array:
     """The longest step, up to 1, that keeps the fraction 1 - tau of each distance (eq. 15a)."""
 
     def one(a: Array, b: Array, d: Array, l: Array, h: Array) -> Array:
@@ -215,7 +219,7 @@ def _longest(gap_low: Primal, gap_high: Primal, dw: Primal, box: _Box, tau: Arra
     return jnp.min(jnp.stack(steps))
 
 
-def _longest_dual(z: Primal, dz: Primal, tau: Array) -> Array:
+def _longest_dual(z: Entries, dz: Entries, tau: Array) -> Array:
     one = lambda z, d: jnp.min(
         jnp.where(d < 0, -tau * z / jnp.where(d < 0, d, -1.0), jnp.inf), initial=1.0
     )
@@ -248,7 +252,7 @@ def _augment(filter: _Filter, theta: Array, phi: Array, add: Array) -> _Filter:
 
 
 def optimality_error(
-    box: _Box, gradient: Primal, w: Primal, y: Rows, zl: Primal, zu: Primal, c: Rows
+    box: _Box, gradient: Entries, w: Entries, y: Rows, zl: Entries, zu: Entries, c: Rows
 ) -> Callable[[Array], Array]:
     """mu -> E_mu of eq. (5): the worst scaled violation of the perturbed conditions. `gradient`:
     of the Lagrangian without its bounds."""
@@ -273,15 +277,14 @@ def optimality_error(
 
 def minimise(program: Transcription, bounds: Bounds, start: Start, options: Options) -> Solution:
     """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
-    box = boxed(bounds)
+    box = _Box(*map(flattened, boxed(bounds)))
     dtype = program.dtype
-    w = inside(box, start.w, options.push)
+    w, net = inside(box, flattened(start.w), options.push), flattened(start.net)
     mu = jnp.asarray(options.mu, dtype)
     low, high = distances(box, w)
     held = lambda a, z, on: jnp.where(on, jnp.maximum(mu / a, z), 0.0)
-    zl = _tree(lambda a, z, on: held(a, -z, on), low, start.net, box.below)
-    zu = _tree(lambda a, z, on: held(a, z, on), high, start.net, box.above)
-    _, c = program.objective_and_residual(w)
+    zl, zu = held(low, -net, box.below), held(high, net, box.above)
+    _, c = program.objective_and_residual(program.shaped(w))
     theta = _norm1(c)
     zero, nought = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
     mode = jnp.where(options.warm, _NEWTON, _ESTIMATE).astype(jnp.int32)
@@ -295,8 +298,9 @@ def minimise(program: Transcription, bounds: Bounds, start: Start, options: Opti
     )  # fmt: skip
     body = lambda s: _pass(program, box, options, s)
     end = jax.lax.while_loop(lambda s: s.status == RUNNING, body, state)
-    _, c = program.objective_and_residual(end.w)
-    return Solution(end.w, end.y, end.zl, end.zu, end.mu, end.status, end.k, end.error, _largest(c))
+    w, zl, zu = (program.shaped(a) for a in (end.w, end.zl, end.zu))
+    _, c = program.objective_and_residual(w)
+    return Solution(w, end.y, zl, zu, end.mu, end.status, end.k, end.error, _largest(c))
 
 
 def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
@@ -315,6 +319,13 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
     return new
 
 
+class _Move(NamedTuple):
+    """A `kkt.Step`, its change of the unknowns as one vector."""
+
+    primal: Array
+    dual: Rows
+
+
 class _Here(NamedTuple):
     """What is known of an iterate before anything is factorised."""
 
@@ -322,15 +333,16 @@ class _Here(NamedTuple):
     ends: Ends
     f: Array
     c: Rows
-    low: Primal
-    high: Primal
+    low: Array
+    high: Array
     error: Callable[[Array], Array]
 
 
 def _evaluated(program: Transcription, box: _Box, s: _State) -> _Here:
-    nodes, ends = program.derivatives(s.w)
-    f, c = program.objective_and_residual(s.w, (nodes.value, ends.value))
-    lagrangian = kkt.gradient(program, nodes, ends, s.w, s.y)
+    w = program.shaped(s.w)
+    nodes, ends = program.derivatives(w)
+    f, c = program.objective_and_residual(w, (nodes.value, ends.value))
+    lagrangian = flattened(kkt.gradient(program, nodes, ends, w, s.y))
     error = optimality_error(box, lagrangian, s.w, s.y, s.zl, s.zu, c)
     return _Here(nodes, ends, f, c, *distances(box, s.w), error)
 
@@ -345,13 +357,16 @@ def _step(
 
     # The system of this kind of step: Newton's; nearest to feasible; multipliers alone.
     flat = restore | estimate
-    hessians = program.hessians(s.w, s.y)
+    w_now = program.shaped(s.w)
+    hessians = program.hessians(w_now, s.y)
     hessians = _where(flat, _tree(jnp.zeros_like, hessians), hessians)
-    sigma = _tree(lambda z, a, u, b: z / a + u / b, s.zl, low, s.zu, high)
-    ones, zeros = _tree(jnp.ones_like, sigma), _tree(jnp.zeros_like, sigma)
-    sigma = _where(estimate, zeros._replace(path=ones.path, end=ones.end), sigma)
-    system = kkt.System(nodes, ends, hessians[0], hessians[1], sigma, box.given)
-    gradient = kkt.gradient(program, nodes, ends, s.w, _tree(jnp.zeros_like, s.y))
+    zeros = jnp.zeros_like(s.w)
+    on = {name: name in ("path", "end") for name in Primal._fields}
+    slacks = flattened(Primal(*(jnp.full_like(getattr(w_now, k), on[k]) for k in on)))
+    sigma = program.shaped(jnp.where(estimate, slacks, s.zl / low + s.zu / high))
+    at_nodes, at_ends = hessians
+    system = kkt.System(nodes, ends, at_nodes, at_ends, sigma, program.shaped(box.given))
+    gradient = flattened(kkt.gradient(program, nodes, ends, w_now, _tree(jnp.zeros_like, s.y)))
     segments = kkt.eliminate(program, system)
     rho = 1e2 * (1 + _largest(hessians))
 
@@ -388,24 +403,22 @@ def _step(
     filter_of = lambda mu: s.filter._replace(used=jnp.where(mu != s.mu, 0, s.filter.used))
 
     pull = barrier_gradient(box, low, high, jnp.ones_like(s.mu))
-    bare = _tree(lambda g, a, b: g - a + b, gradient, s.zl, s.zu)
+    bare = gradient - s.zl + s.zu
     was = _where(flat, _tree(jnp.zeros_like, s.y), s.y)
 
     def load(c: Rows, mu: Array) -> kkt.Load:
-        barrier = _tree(lambda g, b: jnp.where(restore, 0.0, g) + mu * b, gradient, pull)
+        barrier = jnp.where(restore, 0.0, gradient) + mu * pull
         rows = c._replace(path=c.path + kkt.COMPLIANCE * was.path)
-        return kkt.Load(_where(estimate, bare, barrier), rows)
+        return kkt.Load(program.shaped(jnp.where(estimate, bare, barrier)), rows)
 
     # Changes of the bounds' multipliers with a step.
     rate = lambda mu, z, a, dw, on, sign: jnp.where(on, mu / a - z - sign * z / a * dw, 0.0)
 
-    def duals(mu: Array, d: Primal) -> tuple[Primal, Primal]:
-        return (
-            _tree(lambda z, a, d, on: rate(mu, z, a, d, on, 1.0), s.zl, low, d, box.below),
-            _tree(lambda z, a, d, on: rate(mu, z, a, d, on, -1.0), s.zu, high, d, box.above),
-        )
+    def duals(mu: Array, d: Array) -> tuple[Array, Array]:
+        lower = rate(mu, s.zl, low, d, box.below, 1.0)
+        return lower, rate(mu, s.zu, high, d, box.above, -1.0)
 
-    def probed(step: kkt.Step) -> Array:
+    def probed(step: _Move) -> Array:
         """Mehrotra's rule: the barrier falls as much as the step without one would make it."""
         one = jnp.ones_like(mu)
         dzl, dzu = duals(jnp.zeros_like(mu), step.primal)
@@ -421,18 +434,18 @@ def _step(
     # The filter line search: the full step, then its second-order correction, then halves.
     theta, logs = _norm1(c), _barrier(box, s.w, jnp.ones_like(mu))
 
-    def slope_of(mu: Array, d: Primal) -> Array:
-        return _total(_tree(lambda g, b, d: (g + mu * b) * d, gradient, pull, d))
+    def slope_of(mu: Array, d: Array) -> Array:
+        return jnp.dot(gradient + mu * pull, d)
 
     def judge(
-        mu: Array, alpha: Array, slope: Array, d: Primal, length: Array
+        mu: Array, alpha: Array, slope: Array, d: Array, length: Array
     ) -> tuple[Array, Array, Rows, Array]:
         """Whether a move by `length` d is acceptable as a step of size `alpha`."""
         phi = f + mu * logs
         slack = 1e2 * jnp.finfo(phi.dtype).eps * (1 + jnp.abs(phi))
         steep = jnp.where(slope < 0, -slope, 0.0)
         w = _move(s.w, length, d)
-        f_new, c = program.objective_and_residual(w)
+        f_new, c = program.objective_and_residual(program.shaped(w))
         theta_new, phi_new = _norm1(c), f_new + _barrier(box, w, mu)
         sane = jnp.isfinite(theta_new) & jnp.isfinite(phi_new) & (theta_new <= s.theta_max)
         switch = alpha * steep**_S_PHI > _DELTA * theta**_S_THETA
@@ -449,7 +462,9 @@ def _step(
         Before, where the barrier is free, a step without one."""
         k, mu, target, first, _, _, _, _ = carry
         probe = k < 0
-        step = kkt.solve(program, system, segments, factor, load(target, jnp.where(probe, 0.0, mu)))
+        right = load(target, jnp.where(probe, 0.0, mu))
+        solved = kkt.solve(program, system, segments, factor, right)
+        step = _Move(flattened(solved.primal), solved.dual)
         length = _longest(low, high, step.primal, box, tau)
         first = _where(k == 0, (step, length), first)
         ok, f_type, c_new, theta_new = judge(
@@ -464,7 +479,7 @@ def _step(
         return k + 1, mu, target, first, (step, length), ok, f_type, again
 
     target = _where(estimate, _tree(jnp.zeros_like, c), c)
-    none = (kkt.Step(zeros, _tree(jnp.zeros_like, s.y)), jnp.ones_like(s.mu))
+    none = (_Move(zeros, _tree(jnp.zeros_like, s.y)), jnp.ones_like(s.mu))
     no, yes = jnp.array(False), jnp.array(True)
     _, mu, _, (step, longest), latest, full, f_type, _ = jax.lax.while_loop(
         lambda a: a[-1], aim, (jnp.where(free, -1, 0), mu, target, none, none, no, no, yes)
@@ -494,8 +509,8 @@ def _step(
     keep = lambda z, a, on: jnp.where(
         on, jnp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
     )
-    zl = _tree(keep, _move(s.zl, alpha_z, dzl), low, box.below)
-    zu = _tree(keep, _move(s.zu, alpha_z, dzu), high, box.above)
+    zl = keep(s.zl + alpha_z * dzl, low, box.below)
+    zu = keep(s.zu + alpha_z * dzu, high, box.above)
     y = _tree(lambda a, b: a + alpha * (b - a), s.y, moved.dual)
     modest = regular & (_largest(step.dual) <= _MULTIPLIERS_MAX)
     estimated = _where(modest, step.dual, _tree(jnp.zeros_like, s.y))
@@ -504,7 +519,7 @@ def _step(
     new_zl, new_zu = _where(accepted, (zl, zu), (s.zl, s.zu))
 
     # What comes next.
-    evaluate = lambda: program.objective_and_residual(new_w)
+    evaluate = lambda: program.objective_and_residual(program.shaped(new_w))
     f_at, c_at = jax.lax.cond(restore, evaluate, lambda: (f, c))  # asked after restoration alone
     theta_at = _norm1(c_at)
     phi_at = f_at + _barrier(box, new_w, mu)

@@ -61,6 +61,9 @@ class Segments(NamedTuple):
     X: Float[Array, "segment after n v"]
     U: Float[Array, "segment node m v"]
     T: Float[Array, "segment node in v"]  # the nodes' inputs
+    W: Float[Array, "segment node in in"]  # Hessian, springs and barrier of the nodes' inputs
+    H: Float[Array, "segment v v"]  # the same, and the barrier of the states, of v
+    unit: Float[Array, "segment v v"]  # what each delta of states and controls adds to H
 
 
 class _Stage(NamedTuple):
@@ -120,7 +123,7 @@ def eliminate(program: Transcription, system: System) -> Segments:
         to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(count, -1)
         start, G = G[:, :, 0].reshape(count, n), G[:, :, 1:].reshape(count, -1)
         G = jnp.concatenate([G, to_u], axis=1) / weight[None]
-        lu, _, order = jax.lax.linalg.lu(G.T)
+        lu, order = _lu_with_order(G.T)
         basis = lu[:count]
         place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
         free = -solve_triangular(basis, lu[count:].T, trans=1, lower=True, unit_diagonal=True)
@@ -141,7 +144,49 @@ def eliminate(program: Transcription, system: System) -> Segments:
     rest = system.nodes.jacobian.shape[3] - n - m
     clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
     T = jnp.concatenate([x, U, clock], axis=2)
-    return Segments(basis, order, place, weight, X, U, T)
+    W, H, unit = _quadratic(program, system, X, U, T)
+    return Segments(basis, order, place, weight, X, U, T, W, H, unit)
+
+
+def _quadratic(
+    program: Transcription, system: System, X: Array, U: Array, T: Array
+) -> tuple[Array, Array, Array]:
+    """`W`, `H` and `unit` of Segments."""
+    size = program.sizes
+    n, S = size.n, size.segments
+    stiffness, _ = _spring(system)
+    h_q = system.nodes.jacobian[:, :, n + 1 :]
+    W = system.node_hessian + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
+    W = W + _controls_alone(_on_controls(system), n, W.shape[2])
+    flat = lambda a: a.reshape(S, -1, a.shape[3])
+    gram = lambda a, b: jnp.einsum("siv,siw->svw", flat(a), flat(b))
+    H = gram(T, jnp.einsum("skab,skbv->skav", W, T)) + gram(X, system.sigma.x[..., None] * X)
+    if program.arcwise is not None:
+        of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
+        H = H + gram(U, of_columns(U))
+    return W, H, gram(X, X) + gram(U, U)
+
+
+def _controls_alone(diagonal: Float[Array, "segment node m"], n: int, inputs: int) -> Array:
+    """A diagonal of the controls as a matrix of each node's inputs."""
+    room = (n, inputs - n - diagonal.shape[2])
+    whole = jnp.pad(diagonal, ((0, 0), (0, 0), room))
+    return whole[..., None] * jnp.eye(inputs, dtype=diagonal.dtype)[None, None]
+
+
+def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
+    """L and U of the rows of `a` in the `order` that pivoting gives them, in one array.
+
+    The order is read off a further column, which holds the rows' numbers: (L U)_last, rounded. XLA
+    finds it from LAPACK's exchanges one by one, which took longer than the factorisation.
+    """
+    rows, columns = a.shape
+    numbers = jnp.arange(rows, dtype=a.dtype)[:, None]
+    lu = jax.lax.linalg.lu(jnp.concatenate([a, numbers], axis=1))[0]
+    k = min(rows, columns + 1)
+    lower = jnp.tril(lu[:, :k], -1) + jnp.eye(rows, k, dtype=a.dtype)
+    order = jnp.round(lower @ lu[:k, columns])
+    return lu[:, :columns], jnp.clip(order, 0, rows - 1).astype(jnp.int32)
 
 
 def _basic(basis: Array, b: Array) -> Array:
@@ -168,22 +213,10 @@ def factorise(
 ) -> tuple[Factor, Bool[Array, ""]]:
     """With `delta` I added to the Hessian; and whether its inertia is right."""
     size = program.sizes
-    n, m, S = size.n, size.m, size.segments
-    J, W = system.nodes.jacobian, system.node_hessian
-    stiffness, _ = _spring(system)
-    h_q = J[:, :, n + 1 :]
-    W = W + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
-    # Barrier and regularisation of the controls; those of the states apply to all support points.
-    diagonal = jnp.zeros(W.shape[:3], delta.dtype)
-    diagonal = diagonal.at[:, :, n : n + m].set(_on_controls(system) + delta)
-    W = W + diagonal[..., None] * jnp.eye(W.shape[2], dtype=delta.dtype)[None, None]
-    flat = lambda a: a.reshape(S, -1, a.shape[3])
-    T, X = segments.T, segments.X
-    H = jnp.einsum("siv,siw->svw", flat(T), flat(jnp.einsum("skab,skbv->skav", W, T)))
-    H = H + jnp.einsum("siv,siw->svw", flat(X), flat((system.sigma.x + delta)[..., None] * X))
-    if program.arcwise is not None:
-        of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
-        H = H + jnp.einsum("skmv,skmw->svw", segments.U, of_columns(segments.U))
+    n, W = size.n, segments.W
+    everywhere = jnp.broadcast_to(delta, (*W.shape[:2], size.m))
+    W = W + _controls_alone(everywhere, n, W.shape[2])
+    H = segments.H + delta * segments.unit
     stages, P, convex = _sweep(program, segments, H, rho)
     K, held = _globals(program, system, P, delta)
     size_ = jnp.sqrt(jnp.max(jnp.abs(K), axis=1) + 1e-300)

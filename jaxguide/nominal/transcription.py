@@ -3,6 +3,7 @@
 Every function here is evaluated node by node; nothing assembles a matrix of the whole.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -38,6 +39,11 @@ class Primal(NamedTuple):
     p: Float[Array, " parameter"]  # static parameters
     path: Float[Array, "segment node h"]  # slacks: what the path constraints should equal
     end: Float[Array, " q"]  # slacks of the endpoint constraints
+
+
+def flattened(w: Primal) -> Array:
+    """All entries as one vector."""
+    return jnp.concatenate([a.reshape(-1) for a in w])
 
 
 class Rows(NamedTuple):
@@ -162,6 +168,18 @@ class Transcription(eqx.Module):
         s = self.scale
         nodal = lambda a: a[None, None]
         return Primal(s.x, nodal(s.x), nodal(s.u), s.t[None], s.p, nodal(s.path), s.end)
+
+    def shaped(self, vector: Array) -> Primal:
+        """`flattened` undone."""
+        s = self.sizes
+        nodal = (s.segments, s.nodes)
+        shapes = (
+            (s.n,), (s.segments, s.after, s.n), (*nodal, s.m), (s.times,), (s.parameters,),
+            (*nodal, s.path), (s.end,),
+        )  # fmt: skip
+        cuts = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
+        parts = zip(jnp.split(vector, cuts), shapes, strict=True)
+        return Primal(*(part.reshape(shape) for part, shape in parts))
 
     def starts(self, w: Primal) -> Float[Array, "segment n"]:
         """State at the start of every segment."""
