@@ -63,7 +63,6 @@ class Segments(NamedTuple):
     T: Float[Array, "segment node in v"]  # the nodes' inputs
     W: Float[Array, "segment node in in"]  # Hessian, springs and barrier of the nodes' inputs
     H: Float[Array, "segment v v"]  # the same, and the barrier of the states, of v
-    unit: Float[Array, "segment v v"]  # what each delta of states and controls adds to H
 
 
 class _Stage(NamedTuple):
@@ -144,32 +143,43 @@ def eliminate(program: Transcription, system: System) -> Segments:
     rest = system.nodes.jacobian.shape[3] - n - m
     clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
     T = jnp.concatenate([x, U, clock], axis=2)
-    W, H, unit = _quadratic(program, system, X, U, T)
-    return Segments(basis, order, place, weight, X, U, T, W, H, unit)
+    return Segments(basis, order, place, weight, X, U, T, *_quadratic(program, system, X, U, T))
 
 
 def _quadratic(
     program: Transcription, system: System, X: Array, U: Array, T: Array
-) -> tuple[Array, Array, Array]:
-    """`W`, `H` and `unit` of Segments."""
-    size = program.sizes
-    n, S = size.n, size.segments
+) -> tuple[Array, Array]:
+    """`W` and `H` of Segments."""
+    rule, n, inputs = program.rule, program.sizes.n, T.shape[2]
     stiffness, _ = _spring(system)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
     W = system.node_hessian + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
-    W = W + _controls_alone(_on_controls(system), n, W.shape[2])
-    flat = lambda a: a.reshape(S, -1, a.shape[3])
-    gram = lambda a, b: jnp.einsum("siv,siw->svw", flat(a), flat(b))
-    H = gram(T, jnp.einsum("skab,skbv->skav", W, T)) + gram(X, system.sigma.x[..., None] * X)
+    W = W + _on_diagonal(_on_controls(system), n, inputs)
+    # Where every point after the first is a node, its barrier joins the node's own Hessian.
+    sigma = jnp.pad(system.sigma.x, ((0, 0), (1, 0), (0, 0)))
+    own = slice(rule.first, rule.first + program.points)
+    if own.stop == sigma.shape[1]:
+        H = _gram(T, _times(W + _on_diagonal(sigma[:, own], 0, inputs), T))
+    else:
+        H = _gram(T, _times(W, T)) + _gram(X, system.sigma.x[..., None] * X)
     if program.arcwise is not None:
         of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
-        H = H + gram(U, of_columns(U))
-    return W, H, gram(X, X) + gram(U, U)
+        H = H + _gram(U, of_columns(U))
+    return W, H
 
 
-def _controls_alone(diagonal: Float[Array, "segment node m"], n: int, inputs: int) -> Array:
-    """A diagonal of the controls as a matrix of each node's inputs."""
-    room = (n, inputs - n - diagonal.shape[2])
+def _times(W: Array, T: Array) -> Array:
+    return jnp.einsum("skab,skbv->skav", W, T)
+
+
+def _gram(a: Array, b: Array) -> Float[Array, "segment v v"]:
+    flat = lambda a: a.reshape(a.shape[0], -1, a.shape[3])
+    return jnp.einsum("siv,siw->svw", flat(a), flat(b))
+
+
+def _on_diagonal(diagonal: Float[Array, "segment node k"], first: int, inputs: int) -> Array:
+    """`diagonal` of some of each node's inputs as a matrix of all of them."""
+    room = (first, inputs - first - diagonal.shape[2])
     whole = jnp.pad(diagonal, ((0, 0), (0, 0), room))
     return whole[..., None] * jnp.eye(inputs, dtype=diagonal.dtype)[None, None]
 
@@ -215,8 +225,11 @@ def factorise(
     size = program.sizes
     n, W = size.n, segments.W
     everywhere = jnp.broadcast_to(delta, (*W.shape[:2], size.m))
-    W = W + _controls_alone(everywhere, n, W.shape[2])
-    H = segments.H + delta * segments.unit
+    W = W + _on_diagonal(everywhere, n, W.shape[2])
+    regular = lambda: (
+        segments.H + delta * (_gram(segments.X, segments.X) + _gram(segments.U, segments.U))
+    )
+    H = jax.lax.cond(delta > 0, regular, lambda: segments.H)
     stages, P, convex = _sweep(program, segments, H, rho)
     K, held = _globals(program, system, P, delta)
     size_ = jnp.sqrt(jnp.max(jnp.abs(K), axis=1) + 1e-300)
