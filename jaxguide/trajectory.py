@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve
 from jaxguide.problem import Problem, hamiltonian
@@ -106,6 +106,9 @@ class Extremal(Trajectory):
     residual: Float[Array, ""]
     problem: Problem
     certifier: Callable = eqx.field(static=True)
+    # Whether a bound is neither clearly active nor clearly free: derivatives with respect to
+    # parameters then lie between the one-sided ones. None: there are no bounds.
+    degenerate: Bool[Array, ""] | None = None
     # Control and costate may jump at a break: `u` and `costate` hold what follows it.
     u_before: Float[Array, "segment m"] | None = None
     costate_before: Float[Array, "segment n"] | None = None

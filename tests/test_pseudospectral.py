@@ -207,6 +207,29 @@ def test_contradictory_ends_are_infeasible():
 
 
 @pytest.mark.slow  # four programs
+def test_degenerate_bounds_are_flagged():
+    """min int (u - k)^2/2 with u <= 1: for k = 1 the bound is just touched, and dx(tf)/dk jumps
+    from 1 to 0."""
+
+    class Touch(jg.Problem):
+        k: float = 1.0
+        state_names = ("x",)
+        control_names = ("u",)
+        initial_state = (0.0,)
+        final_time = 1.0
+        control_bounds = (-jnp.inf, 1.0)
+
+        def dynamics(self, t, x, u):
+            return u
+
+        def running_cost(self, t, x, u):
+            return (u[0] - self.k) ** 2 / 2
+
+    method = jg.Pseudospectral(nodes=4, segments=1, refinements=0)
+    flags = [bool(jg.solve(Touch(k=k), method).degenerate) for k in (0.9, 1.0, 1.1)]
+    assert flags == [False, True, False]
+
+
 def test_implicit_derivatives_with_an_active_bound():
     """d tf of a bang-bang landing by gravity, the thrust limit and the initial height, both ways,
     against finite differences of solutions on the same mesh."""
@@ -327,6 +350,40 @@ def test_phases():
     np.testing.assert_allclose(burn.x[0], fall.x[-1], atol=1e-9)
     np.testing.assert_allclose(burn.costate[0], fall.costate[-1], atol=1e-7)
     assert bool(burn.certificate.passed.all()), str(burn.certificate)
+
+
+@pytest.mark.slow
+def test_goddard_in_three_phases():
+    """Boost, singular arc, coast: with the singular control kept smooth, the optimum to what is
+    known of it; where it is not, the control oscillates and overshoots it by 2e-5."""
+
+    class Boost(problems.Goddard):
+        control_bounds = (1.0, 1.0)
+        final_time = jg.Free(0.005, 0.1, 0.02)
+
+        def endpoint_cost(self, x0, xf, t0, tf):
+            return 0.0
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return jnp.zeros(0)
+
+    class Singular(Boost):
+        control_bounds = (0.0, 1.0)
+        initial_state = None
+        initial_time = jg.Free(0.005, 0.1, 0.02)
+        final_time = jg.Free(0.03, 0.2, 0.07)
+
+    class Coast(problems.Goddard):
+        control_bounds = (0.0, 0.0)
+        initial_state = None
+        initial_time = jg.Free(0.03, 0.2, 0.07)
+        final_time = jg.Free(0.1, 0.4, 0.2)
+        state_bounds = ((1.0, -1.0, 0.5), (2.0, 2.0, 1.0))  # the mass stays at its end value, 0.6
+
+    method = jg.Pseudospectral(nodes=12, segments=1, refinements=0, smoothing=(0.0, 100.0, 0.0))
+    e = jg.solve(jg.Phased((Boost(), Singular(), Coast())), method)
+    known = problems.reference("goddard")
+    np.testing.assert_allclose(e.objective, known.value, atol=known.uncertainty)
 
 
 def test_phases_that_do_not_join_are_refused():

@@ -5,14 +5,15 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxguide.nominal import interior_point, kkt
 from jaxguide.nominal.mesh import left_null
 from jaxguide.nominal.shooting import unwrap_angles
-from jaxguide.nominal.transcription import Bounds, Transcription, node_times
+from jaxguide.nominal.transcription import Bounds, Transcription, bounds, node_times
 from jaxguide.problem import Problem, with_parameters
 from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
@@ -99,9 +100,24 @@ def to_extremal(
         ),
         result=result,
         residual=solution.violation,
+        degenerate=_undecided(program, solution),
         problem=problem,
         certifier=certifier,
     )
+
+
+def _undecided(program: Transcription, solution: interior_point.Solution) -> Bool[Array, ""]:
+    """Whether a bound's distance and multiplier, whose product is the barrier mu, are both small:
+    within a factor of 10 of sqrt(mu), where the barrier's derivative is off by a hundredth."""
+    box = interior_point.boxed(bounds(program))
+    small = 10 * jnp.sqrt(solution.mu)
+    weak = lambda gap, z, on: jnp.any(on & (gap < small) & (z < small))
+    sides = zip(
+        interior_point.distances(box, solution.w), (solution.zl, solution.zu),
+        (box.below, box.above), strict=True,
+    )  # fmt: skip
+    found = [jax.tree_util.tree_leaves(jax.tree_util.tree_map(weak, *side)) for side in sides]
+    return jnp.any(jnp.stack(found[0] + found[1]))
 
 
 def costates(

@@ -20,7 +20,8 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
 
     Active bounds are held by their barrier: at its last value mu a bound's curvature is z^2/mu, so
     that it moves by mu/z of what a free one would. Where z is itself of the order of sqrt(mu) (a
-    bound just touched, a singular arc) the derivative is that of the barrier problem.
+    bound just touched, a singular arc) the derivative is that of the barrier problem, and the
+    extremal's `degenerate` says so.
     """
     w, y, mu = solution.w, solution.y, solution.mu
     given = boxed(bounds(program)).given

@@ -50,6 +50,8 @@ class Pseudospectral(eqx.Module):
       (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
       others keep their places between them. For switches, kinks and junctions.
     - `arcwise`: what is known of each segment's arc: controls at bounds, singular, and so on.
+    - `smoothing`: of controls known to be singular, a number or (m,): weights of the squares of the
+      upper half of their Legendre coefficients, as in `Arcwise.smooth`; of the order of 100.
     - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
       (n,): delta^N of problem B^N. Zero: not at all.
     - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
@@ -78,6 +80,7 @@ class Pseudospectral(eqx.Module):
     fractions: Any = None
     knots: tuple[int, ...] = eqx.field(static=True, default=())
     arcwise: Arcwise | None = None
+    smoothing: Any = eqx.field(static=True, default=0.0)
     relaxation: Any = eqx.field(static=True, default=0.0)
     time_scale: float = eqx.field(static=True, default=1.0)
     starts: int = eqx.field(static=True, default=1)
@@ -127,8 +130,11 @@ class Pseudospectral(eqx.Module):
                 f"Pseudospectral: knots is {self.knots}; name each inner break once, from 1 to "
                 f"{breaks - 1}."
             )
-        if not np.all(np.asarray(self.relaxation) >= 0):
-            raise ValueError(f"Pseudospectral: relaxation is {self.relaxation}; need at least 0.")
+        for name in ("relaxation", "smoothing"):
+            if not np.all(np.asarray(getattr(self, name)) >= 0):
+                raise ValueError(
+                    f"Pseudospectral: {name} is {getattr(self, name)}; need at least 0."
+                )
         if not self.time_scale > 0:
             raise ValueError(f"Pseudospectral: time_scale is {self.time_scale}; give one above 0.")
         collocation(self.grid, self.nodes)
@@ -172,9 +178,14 @@ class Pseudospectral(eqx.Module):
         delta = jnp.broadcast_to(jnp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
         return relaxed(whole, jnp.pad(delta, (0, whole.n - problem.n)))
 
-    def _arcwise(self, whole: Problem) -> Arcwise | None:
-        """`arcwise` with entries for the states and controls that `whole` has besides."""
+    def _arcwise(self, problem: Problem, whole: Problem, segments: int) -> Arcwise | None:
+        """`arcwise`, `smoothing` added, with entries for what `whole` has besides."""
         known = self.arcwise
+        if np.any(np.asarray(self.smoothing)):
+            known = Arcwise.blank(segments, problem) if known is None else known
+            weights = jnp.asarray(self.smoothing, jnp.result_type(float))
+            weights = known.smooth + jnp.broadcast_to(weights, (problem.m,))[None]
+            known = eqx.tree_at(lambda a: a.smooth, known, weights)
         if known is None:
             return None
         more = lambda a, k: jnp.pad(a, (*((0, 0),) * (a.ndim - 1), (0, k - a.shape[-1])))
@@ -200,8 +211,8 @@ class Pseudospectral(eqx.Module):
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
         program = Transcription(
-            whole, unit, edges(fractions, self.knots), family, self.nodes, self._arcwise(whole),
-            self.log,
+            whole, unit, edges(fractions, self.knots), family, self.nodes,
+            self._arcwise(problem, whole, fractions.shape[0] - 1), self.log,
         )  # fmt: skip
         if guess is None:
             w = straight_guess(program, fractions, self.knots)

@@ -176,11 +176,8 @@ def _meshed(
     knots: tuple = (),
     arcwise: Arcwise | None = None,
 ) -> Pseudospectral:
-    return Pseudospectral(
-        method.grid, nodes, len(fractions) - 1, fractions, knots, arcwise, method.relaxation,
-        method.time_scale, 1, method.seed, method.tolerance, method.max_iterations,
-        method.refinements, method.mesh_tolerance, method.log, method.quick,
-    )  # fmt: skip
+    changed: dict[str, Any] = {"nodes": nodes, "segments": len(fractions) - 1, "starts": 1}
+    return dataclasses.replace(method, fractions=fractions, knots=knots, arcwise=arcwise, **changed)
 
 
 def structured(

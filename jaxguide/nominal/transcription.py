@@ -112,6 +112,15 @@ class Arcwise(eqx.Module):
     released: Bool[Array, "segment two n"]
     unpathed: Bool[Array, "segment h"]
 
+    @classmethod
+    def blank(cls, segments: int, problem: Problem) -> "Arcwise":
+        """Nothing known."""
+        zero = jnp.zeros((segments, problem.m), jnp.result_type(float))
+        released = jnp.zeros((segments, 2, problem.n), bool)
+        return cls(
+            zero, zero, released, jnp.zeros((segments, count(problem, "path_constraints")), bool)
+        )
+
 
 class Transcription(eqx.Module):
     """A Problem on S segments, `points` nodes of `family` each; their breaks are the combinations
