@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.montecarlo.sweep import over_cores
+from jaxguide.montecarlo.cores import over_cores
 from jaxguide.problem import Problem, with_array_leaves
-from jaxguide.progress import Progress
+from jaxguide.progress import Progress, metered
 from jaxguide.solving import chosen, compiled, on_fixed_mesh, solve
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
@@ -71,7 +71,8 @@ def solve_batch(
 
     # The first alone: it compiles.
     chunks = -(-count // CHUNK)
-    parts = [chunk(0), *over_cores(lambda k: chunk(k + 1), chunks - 1, progress, workers)]
+    later = over_cores(chunk, range(1, chunks), workers)
+    parts = [chunk(0), *metered(later, chunks - 1, progress)]
     out = _tree(lambda *a: jnp.asarray(np.concatenate(a)), *parts)
     failed = np.flatnonzero(np.asarray(out.result != RESULTS.successful))
     if throw and failed.size:

@@ -4,7 +4,8 @@ Host-only: the pure functions never see it. The default everywhere is none.
 """
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
@@ -40,42 +41,53 @@ class NoProgress:
 
 
 class RichProgress:
-    """A bar on stderr with the time elapsed; it pulses until the first `step`.
+    """A bar on stderr with the time elapsed and left; it pulses until the first `step`.
 
-    Nothing is shown where stderr is not a terminal.
+    Nothing is shown where stderr is neither a terminal nor a notebook's.
 
     **Arguments:**
 
     - `label`: what is being done.
     - `delay`: seconds before it appears, so that quick work shows nothing.
+    - `total`, `unit`: of what there is to do, for a rate such as "490,000 flights/s".
     """
 
-    def __init__(self, label: str, delay: float = 2.0):
-        self.label = label
-        self.delay = delay
+    def __init__(self, label: str, delay: float = 2.0, total: int | None = None, unit: str = ""):
+        self.label, self.delay = label, delay
+        self.total, self.unit = total, unit
 
     def init(self) -> Any:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
         from rich.progress import TimeElapsedColumn as Elapsed
+        from rich.progress import TimeRemainingColumn as Left
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), Elapsed())
+        columns: list[Any] = [TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()]
+        if self.total is not None:
+            columns.append(TextColumn("{task.fields[rate]}"))
         console = Console(stderr=True)
         # Without `disable` a redirected stderr would collect blank lines.
-        bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        task = bar.add_task(self.label, total=None)
+        shown = console.is_terminal or console.is_jupyter
+        bar = Progress(
+            *columns, Elapsed(), Left(), console=console, transient=True, disable=not shown
+        )
+        task = bar.add_task(self.label, total=None, rate="")
         timer = threading.Timer(self.delay, bar.start)
         timer.daemon = True
         timer.start()
-        return bar, task, timer
+        return bar, task, timer, time.perf_counter()
 
     def step(self, state: Any, progress: Any) -> Any:
-        bar, task, _ = state
-        bar.update(task, total=1.0, completed=float(progress))
+        bar, task, _, began = state
+        rate = ""
+        if self.total is not None:
+            a_second = float(progress) * self.total / max(time.perf_counter() - began, 1e-9)
+            rate = f"{a_second:,.0f} {self.unit}/s"
+        bar.update(task, total=1.0, completed=float(progress), rate=rate)
         return state
 
     def close(self, state: Any) -> None:
-        bar, _, timer = state
+        bar, _, timer, _ = state
         timer.cancel()
         timer.join()  # a bar about to start has started, so that stop ends it
         bar.stop()
@@ -88,5 +100,17 @@ def waiting(meter: Progress | None) -> Iterator[None]:
     state = meter.init()
     try:
         yield
+    finally:
+        meter.close(state)
+
+
+def metered(items: Iterable[Any], count: int, meter: Progress | None) -> Iterator[Any]:
+    """`items`, `meter` shown how many of `count` have come."""
+    meter = NoProgress() if meter is None else meter
+    state = meter.init()
+    try:
+        for done, item in enumerate(items, 1):
+            yield item
+            state = meter.step(state, done / count)
     finally:
         meter.close(state)

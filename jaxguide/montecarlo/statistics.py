@@ -16,7 +16,7 @@ def percentile_bounds(values: np.ndarray, percent: float, confidence: float = 0.
     """
     ordered = np.sort(values)
     count, p = ordered.size, percent / 100
-    z = _normal_quantile(0.5 + confidence / 2)
+    z = normal_quantile(0.5 + confidence / 2)
     spread = z * math.sqrt(count * p * (1 - p))
     low, high = math.floor(count * p - spread) - 1, math.ceil(count * p + spread)
     bound = lambda rank, beyond: float(ordered[rank]) if 0 <= rank < count else beyond
@@ -28,7 +28,7 @@ def wilson_bounds(successes: int, count: int, confidence: float = 0.95) -> tuple
     """Wilson score bounds of a success rate."""
     if count == 0:
         return 0.0, 1.0
-    z = _normal_quantile(0.5 + confidence / 2)
+    z = normal_quantile(0.5 + confidence / 2)
     rate = successes / count
     centre = (rate + z * z / (2 * count)) / (1 + z * z / count)
     half = z * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count**2)) / (1 + z * z / count)
@@ -50,7 +50,7 @@ def summarise(values: np.ndarray, names: tuple[str, ...]) -> dict[str, Any]:
     return summary
 
 
-def _normal_quantile(p: float) -> float:
+def normal_quantile(p: float) -> float:
     from statistics import NormalDist
 
     return NormalDist().inv_cdf(p)

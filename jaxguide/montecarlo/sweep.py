@@ -1,201 +1,178 @@
-"""`jg.sweep`: many dispersed flights in fixed tiles, and their statistics. Host only."""
+"""`jg.sweep`: many dispersed flights and their statistics, in memory or into a store. Host only."""
 
-import functools
-import os
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission
-from jaxguide.flight.simulate import Prepared, simulate
-from jaxguide.montecarlo.covariance import linear_covariance
+from jaxguide.montecarlo.cluster import over_workers
+from jaxguide.montecarlo.cores import over_cores
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import apply, draw, shared
-from jaxguide.montecarlo.statistics import summarise, wilson_bounds
+from jaxguide.montecarlo.identity import manifest
+from jaxguide.montecarlo.rollouts import draw
+from jaxguide.montecarlo.statistics import wilson_bounds
+from jaxguide.montecarlo.store import Memory, Store
+from jaxguide.montecarlo.tally import Tally
+from jaxguide.montecarlo.tiles import TILE, Order, Tiles, code, message
+from jaxguide.progress import NoProgress
 from jaxguide.types import RESULTS
 
 if TYPE_CHECKING:
     import xarray
 
-# Lanes flown together: fixed, so that a case has the same bits in any sweep; its working set stays
-# in a core's cache (chosen by experiment).
-TILE = 4096
+CHUNK = 65_536  # cases written at once
+_KEEP = ("all", "summary")
+_MOST = 1e9  # bytes of results that a sweep keeps in memory
 
 
 def sweep(
     mission: Mission,
-    dispersions: dict[str, Distribution],
+    dispersions: dict[Any, Distribution],
     cases: int,
     seed: int,
     *,
     store: Any = None,
-    scheduler: Any = None,
+    resume: bool = False,
+    scheduler: str | None = None,
     dtype: str | None = None,
+    keep: str = "all",
+    chunk: int = CHUNK,
     tile: int = TILE,
+    devices: Any = None,
     progress: Any = None,
 ) -> "xarray.Dataset":
     """Flies `cases` dispersed missions and returns them as an xarray Dataset.
 
     Case k depends on (seed, k) alone. Cases are flown in fixed tiles of `tile` lanes, each in its
-    own place of its tile, so that the same case gives the same bits whatever `cases` is. A failed
-    case is a row with its reason, never an exception.
+    own place of its tile, so that a case has the same bits whatever `cases`, `chunk`, `devices`
+    and `scheduler` are; sums are taken tile by tile, in order, so that statistics have too. A
+    failed case is a row with its reason, never an exception.
 
-    **Arguments:** `dispersions`: path -> distribution; `dtype`: "float64" or "float32" (default
-    the mission's own); `progress`: an object with init, step, close; `store`, `scheduler`: not
-    yet; must be None.
+    **Arguments:**
 
-    **Returns:** variables `initial_state`, `final_state` (case, state), `result` (case,), and
-    `draw:path` for every dispersed leaf; attributes `rollouts_per_s` (warm), `compile_s`,
-    `percentiles` (with confidence bounds), `success_rate` with Wilson bounds, `failures`, and the
-    linear covariance beside the sampled one.
+    - `dispersions`: path (or paths, as a tuple) -> distribution.
+    - `store`: a directory for a Zarr store (needs `jaxguide[sweep]`); the Dataset is then read
+      from it when asked. Written chunk by chunk: killed at any instant, the same sweep with
+      `resume` ends with the same bits.
+    - `scheduler`: address of a Dask scheduler, "tcp://host:port", or "local" for a cluster of
+      processes here; chunks go to its workers, and again if one dies.
+    - `dtype`: "float64" or "float32" (default the mission's own).
+    - `keep`: "all", or "summary": statistics and each case's result alone.
+    - `chunk`: cases written at once, rounded up to whole tiles. `devices`: JAX devices to fly on
+      (default all local ones). `progress`: an object with init, step, close.
 
-    **Raises:** `ValueError` for bad arguments.
+    **Returns:** variables `initial_state`, `final_state` (case, state), `saturated`, `result`
+    (case,), `draw:path` for every dispersed leaf, `final_time` where the law decides it; attributes
+    `rollouts_per_s` (warm), `compile_s`, `percentiles` (with confidence bounds), `success_rate`
+    with Wilson bounds, `failures`, and the linear covariance beside the sampled one.
+
+    **Error:** percentiles to 2^-12 of their distance from the undispersed flight.
+
+    **Raises:** `ValueError` for bad arguments, a store of another sweep or a scheduler that does
+    not answer; `OSError` where the store cannot be written: what was is kept.
     """
-    import xarray as xr
-
-    for name, value in (("store", store), ("scheduler", scheduler)):
-        if value is not None:
-            raise ValueError(f"sweep: {name} is {value!r}, but sweeps run in memory; leave it out.")
-    if cases < 1:
-        raise ValueError(f"sweep: cases is {cases}; give at least 1.")
-    if tile < 1:
-        raise ValueError(f"sweep: tile is {tile}; give at least 1.")
+    _check(cases, tile, chunk, keep, resume, store)
     if dtype is not None:
         mission = cast(mission, dtype)
     check = lambda: draw(mission, dispersions, jax.random.key(0))
     jax.eval_shape(check)  # refuses bad paths and shapes at once
 
-    tiles = -(-cases // tile)
-    key = jax.random.key(seed)
-    began = time.perf_counter()
-    prepared = _prepare(mission, dispersions)
-    # What is not an array (a disturbance given as a function, say) is part of the program.
-    given, rest = eqx.partition((mission, dispersions, prepared), eqx.is_array)
-    rest = jax.tree_util.tree_flatten(rest)
-    fly = _program(jax.default_backend())
-    one = lambda i: jax.device_get(fly(given, key, jnp.asarray(i), tuple(rest[0]), rest[1], tile))
-    one(0)
-    compile_s = time.perf_counter() - began  # the first tile's flight included
+    order = Order(mission, dispersions, seed, cases, tile)
+    tiles = Tiles(order, devices)
+    variables = {k: v for k, v in tiles.rows().items() if keep == "all" or k == "result"}
+    each = -(-chunk // tile)
+    coordinates = {"state": np.array(mission.plant.state_names)}
+    if store is None:
+        need = cases * sum(
+            np.prod(shape) * dtype.itemsize for _, shape, dtype in variables.values()
+        )
+        if need > _MOST:
+            raise ValueError(
+                f"sweep: {cases} cases would leave {need / 1e9:.1f} GB in memory; give a store to "
+                'write them to, or keep="summary".'
+            )
+        book: Any = Memory(variables, coordinates, cases, each * tile)
+    else:
+        described = manifest(order) | {"keep": keep}
+        book = Store(Path(store), described, variables, coordinates, each * tile, resume)
+    todo = [k for k in range(-(-tiles.count // each)) if not book.has(k)]
 
     began = time.perf_counter()
-    parts = over_cores(one, tiles, progress)
+    if todo and scheduler is None:
+        tiles.fly(todo[0] * each)
+    compile_s = time.perf_counter() - began  # a tile's flight included
+    began, flown = time.perf_counter(), 0
+    meter = NoProgress() if progress is None else progress
+    state = meter.init()
+    try:
+        for k, rows, sums in _flown(tiles, todo, each, scheduler):
+            book.write(k, {name: rows[name] for name in variables}, sums)
+            flown += len(rows["result"])
+            state = meter.step(state, flown / max(min(cases, len(todo) * each * tile), 1))
+    finally:
+        meter.close(state)
     elapsed = time.perf_counter() - began
-    joined = jax.tree_util.tree_map(lambda *leaves: np.concatenate(leaves)[:cases], *parts)
-
-    good = joined["code"] == _code(RESULTS.successful)
-    states = mission.plant.state_names
-    reasons, counts = np.unique(joined["code"][~good], return_counts=True)
-    failures = {_message(int(code)): int(k) for code, k in zip(reasons, counts, strict=True)}
-    centre, covariance = linear_covariance(mission, dispersions, prepared)
-    finals = joined["final_state"][good]
     attrs = {
         "cases": cases,
         "seed": seed,
         "tile": tile,
-        "dtype": str(joined["final_state"].dtype),
-        "rollouts_per_s": tiles * tile / elapsed,
+        "dtype": str(mission.initial_state.dtype),
+        "rollouts_per_s": flown / elapsed,
         "compile_s": compile_s,
-        "failures": failures,
-        "success_rate": float(good.mean()),
-        "success_rate_bounds": wilson_bounds(int(good.sum()), cases),
-        "percentiles": summarise(finals, states),
-        "nominal_final_state": np.asarray(centre).tolist(),
-        "linear_covariance": np.asarray(covariance).tolist(),
-        "sample_covariance": (np.cov(finals.T) if len(finals) > 1 else np.zeros(covariance.shape))
-        .reshape(covariance.shape)
-        .tolist(),
+        **_statistics(tiles, book, cases),
     }
-    variables = {
-        "initial_state": (("case", "state"), joined["initial_state"]),
-        "final_state": (("case", "state"), joined["final_state"]),
-        "saturated": (("case",), joined["saturated"]),
-        "result": (("case",), joined["code"]),
+    return book.dataset(attrs)
+
+
+def _check(cases: int, tile: int, chunk: int, keep: str, resume: bool, store: Any) -> None:
+    for name, value in (("cases", cases), ("tile", tile), ("chunk", chunk)):
+        if value < 1:
+            raise ValueError(f"sweep: {name} is {value}; give at least 1.")
+    if keep not in _KEEP:
+        raise ValueError(f"sweep: keep is {keep!r}; choose one of {', '.join(_KEEP)}.")
+    if resume and store is None:
+        raise ValueError("sweep: resume needs the store to go on with.")
+
+
+def _flown(
+    tiles: Tiles, todo: list[int], each: int, scheduler: str | None
+) -> Iterator[tuple[int, dict, dict]]:
+    """Number, rows and sums of each chunk of `todo`."""
+    of_chunk = lambda k: range(k * each, min((k + 1) * each, tiles.count))
+    if scheduler is not None:
+        yield from over_workers(tiles.order, {k: of_chunk(k) for k in todo}, each, scheduler)
+        return
+    flown = over_cores(tiles.fly, (i for k in todo for i in of_chunk(k)))
+    for k in todo:
+        rows, sums = tiles.chunk([next(flown) for _ in of_chunk(k)], each)
+        yield k, rows, sums
+
+
+def _statistics(tiles: Tiles, book: Any, cases: int) -> dict[str, Any]:
+    totals = book.totals()
+    tally = Tally(*tiles.reference, totals["moments"], totals["histogram"])
+    codes = totals["codes"]
+    good = int(codes[code(RESULTS.successful)])
+    n = len(tiles.order.mission.plant.state_names)
+    return {
+        "failures": {
+            message(i): int(count)
+            for i, count in enumerate(codes)
+            if count and i != code(RESULTS.successful)
+        },
+        "success_rate": good / cases,
+        "success_rate_bounds": wilson_bounds(good, cases),
+        "percentiles": tally.summary(tiles.names),
+        "nominal_final_state": tiles.centre.tolist(),
+        "linear_covariance": tiles.covariance.tolist(),
+        "sample_covariance": tally.covariance[:n, :n].tolist(),
     }
-    for path, values in joined["draws"].items():
-        dims = ("case",) + tuple(f"{path}:{j}" for j in range(values.ndim - 1))
-        variables[f"draw:{path}"] = (dims, values)
-    return xr.Dataset(
-        variables, coords={"case": np.arange(cases), "state": list(states)}, attrs=attrs
-    )
-
-
-def case_key(seed: Any, case: Any) -> Array:
-    """The PRNG key of case `case`: (seed, case) and nothing else."""
-    key = seed if isinstance(seed, jax.Array) else jax.random.key(seed)
-    return jax.random.fold_in(key, case)
-
-
-def over_cores(
-    work: Callable[[int], Any], count: int, progress: Any = None, workers: int | None = None
-) -> list[Any]:
-    """`[work(0), ..., work(count - 1)]`, one thread a core: XLA flies each tile on one core and
-    lets go of the interpreter lock meanwhile."""
-    state = None if progress is None else progress.init()
-    results = []
-    try:
-        with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-            for i, result in enumerate(pool.map(work, range(count))):
-                results.append(result)
-                if progress is not None:
-                    state = progress.step(state, (i + 1) / count)
-    finally:
-        if progress is not None:
-            progress.close(state)
-    return results
-
-
-def compiler_options() -> dict[str, Any]:
-    """What XLA should do for flights: on CPU, use the full width of the vector units."""
-    return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
-
-
-_prepare = eqx.filter_jit(shared)
-
-
-@functools.cache
-def _program(backend: str) -> Any:
-    """The compiled flight of one tile; one function, so that a second sweep compiles nothing."""
-    del backend  # in the key of the cache, since it decides the options
-
-    def tile_of(
-        given: Any, key: Array, index: Array, leaves: tuple, treedef: Any, tile: int
-    ) -> dict[str, Any]:
-        rest = jax.tree_util.tree_unflatten(treedef, leaves)
-        mission, dispersions, prepared = eqx.combine(given, rest)
-        return _fly_tile(mission, dispersions, prepared, key, index, tile)
-
-    return jax.jit(tile_of, static_argnums=(3, 4, 5), compiler_options=compiler_options())
-
-
-def _fly_tile(
-    mission: Mission,
-    dispersions: dict[str, Distribution],
-    prepared: Prepared | None,
-    key: Array,
-    index: Array,
-    tile: int,
-) -> dict[str, Any]:
-    def fly(case: Array) -> dict[str, Any]:
-        k_draw, k_noise = jax.random.split(case_key(key, case))
-        draws = draw(mission, dispersions, k_draw)
-        flown = apply(mission, draws)
-        flight = simulate(flown, k_noise, "ends", prepared)
-        return {
-            "initial_state": flown.initial_state,
-            "final_state": flight.final_state,
-            "saturated": flight.saturated,
-            "code": flight.result._value,
-            "draws": draws,
-        }
-
-    return jax.vmap(fly)(index * tile + jnp.arange(tile))
 
 
 def cast(mission: Mission, dtype: str) -> Mission:
@@ -207,14 +184,3 @@ def cast(mission: Mission, dtype: str) -> Mission:
     floating = lambda a: eqx.is_array(a) and jnp.issubdtype(a.dtype, jnp.floating)
     change = lambda a: a.astype(dtype) if floating(a) else a
     return jax.tree_util.tree_map(change, mission)
-
-
-def _code(item: RESULTS) -> int:
-    return int(item._value)  # pyright: ignore
-
-
-def _message(code: int) -> str:
-    for name in RESULTS._name_to_item:  # pyright: ignore
-        if _code(getattr(RESULTS, name)) == code:
-            return name
-    return f"code {code}"

@@ -1,0 +1,25 @@
+"""Work spread over host threads: XLA runs each program on one core and lets go of the interpreter's
+lock meanwhile. Host only."""
+
+import collections
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+
+def over_cores(
+    work: Callable[[Any], Any], items: Iterable[Any], workers: int | None = None
+) -> Iterator[Any]:
+    """`work` of each item, in order, a few ahead of what is asked for."""
+    workers = workers or os.cpu_count() or 1
+    pool = ThreadPoolExecutor(workers)
+    try:
+        left = iter(items)
+        ahead = collections.deque(pool.submit(work, i) for i in itertools.islice(left, 3 * workers))
+        while ahead:
+            yield ahead.popleft().result()
+            ahead.extend(pool.submit(work, i) for i in itertools.islice(left, 1))
+    finally:
+        pool.shutdown(cancel_futures=True)

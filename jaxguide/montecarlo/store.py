@@ -1,0 +1,225 @@
+"""A sweep's Zarr store: written chunk by chunk, killed at any instant, gone on with. Host only.
+
+Cases lie in the root group, so that `xr.open_zarr` shows them and nothing else. The group `partial`
+holds each tile's moments and each chunk's histogram and, written last, its digest: a chunk counts
+only if its digest is there and right. Zarr replaces whole files, so none is ever half new.
+"""
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = 1
+_DIGEST = 32  # bytes
+
+
+class Store:
+    """Opens or makes the store at `path` for a sweep that `manifest` describes.
+
+    **Raises:** `ValueError` where another sweep's results lie there, naming what differs, or where
+    some lie there and `resume` is not set; `OSError` where nothing can be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        manifest: dict[str, Any],
+        variables: dict[str, tuple[tuple[str, ...], tuple[int, ...], Any]],
+        coordinates: dict[str, np.ndarray],  # names
+        chunk: int,
+        resume: bool,
+    ):
+        zarr = _zarr()
+        self.path, self.chunk = Path(path), chunk
+        self.cases = int(manifest["cases"])
+        self.chunks = -(-self.cases // chunk)
+        manifest = {"format": FORMAT, "chunk": chunk, **manifest}
+        found = self._found()
+        if found is None and self.path.exists() and any(self.path.iterdir()):
+            raise ValueError(
+                f"{self.path} holds files but no sweep; give an empty or a new directory."
+            )
+        if found is not None:
+            _same(manifest, found, self.path)
+            if not resume:
+                raise ValueError(
+                    f"{self.path} already holds this sweep, or a part of it; pass resume=True "
+                    "(--resume) to go on with it, or give another directory."
+                )
+            for left in self.path.rglob("*.partial"):
+                left.unlink()
+        else:
+            self._make(zarr, manifest, variables, coordinates)
+        self.root = zarr.open_group(self.path, mode="r+")
+        self.partial: Any = self.root["partial"]
+        self.names = sorted(variables)
+
+    def _found(self) -> dict[str, Any] | None:
+        """The manifest of what lies there; none where its making was not finished."""
+        described = self.path / "zarr.json"
+        if not described.exists():
+            return None
+        attributes = json.loads(described.read_text()).get("attributes", {})
+        return attributes.get("sweep")
+
+    def _make(self, zarr: Any, manifest: Any, variables: Any, coordinates: Any) -> None:
+        """Everything beside the final path first, then moved there at once."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        beside = self.path.with_name(self.path.name + ".new")
+        shutil.rmtree(beside, ignore_errors=True)
+        root = zarr.open_group(beside, mode="w", zarr_format=3)
+        for name, (dims, shape, dtype) in variables.items():
+            root.create_array(
+                name, shape=(self.cases, *shape), chunks=(self.chunk, *(max(k, 1) for k in shape)),
+                dtype=dtype, dimension_names=dims,
+            )  # fmt: skip
+        for name, values in coordinates.items():
+            array = root.create_array(
+                name, shape=values.shape, chunks=values.shape, dtype="string",
+                dimension_names=(name,),
+            )  # fmt: skip
+            array[...] = values
+        root.create_group("partial").create_array(
+            "digest", shape=(self.chunks, _DIGEST), chunks=(1, _DIGEST), dtype="uint8"
+        )
+        root.attrs["sweep"] = manifest  # last: what has it is whole
+        if self.path.exists():
+            self.path.rmdir()
+        beside.rename(self.path)
+
+    def write(self, k: int, rows: dict[str, np.ndarray], sums: dict[str, np.ndarray]) -> None:
+        """Chunk `k`: its cases and its sums, then its digest."""
+        at = slice(k * self.chunk, min((k + 1) * self.chunk, self.cases))
+        for name, values in rows.items():
+            self.root[name][at] = values[: at.stop - at.start]
+        for name, values in sums.items():
+            if name not in self.partial:
+                self.partial.create_array(
+                    name, shape=(self.chunks, *values.shape), chunks=(1, *values.shape),
+                    dtype=values.dtype,
+                )  # fmt: skip
+            self.partial[name][k] = values
+        self.partial["digest"][k] = _digest(self.read(k))
+
+    def read(self, k: int) -> dict[str, np.ndarray]:
+        """Everything of chunk `k`."""
+        at = slice(k * self.chunk, min((k + 1) * self.chunk, self.cases))
+        rows = {name: self.root[name][at] for name in self.names}
+        sums = {f"partial/{n}": a[k] for n, a in sorted(self.partial.arrays()) if n != "digest"}
+        return rows | sums
+
+    def totals(self) -> dict[str, np.ndarray]:
+        """Sums of all chunks: moments tile by tile, the others added up."""
+        totals = Totals()
+        for k in range(self.chunks):
+            totals.add({name: a[k] for name, a in self.partial.arrays() if name != "digest"})
+        return totals.all()
+
+    def has(self, k: int) -> bool:
+        """Whether chunk `k` is there and as it was written."""
+        try:
+            written = self.partial["digest"][k]
+            return bool(written.any()) and np.array_equal(written, _digest(self.read(k)))
+        except Exception:  # whatever a codec says of a file cut short
+            return False
+
+    def dataset(self, attrs: dict[str, Any]) -> Any:
+        """The cases, read when asked for, with `attrs`."""
+        import xarray as xr
+
+        lazy = xr.open_zarr(self.path, consolidated=False, chunks=None)
+        return lazy.drop_attrs().assign_attrs(attrs).assign_coords(case=np.arange(self.cases))
+
+
+class Totals:
+    """Adds up the sums of chunks."""
+
+    def __init__(self):
+        self._moments: list[np.ndarray] = []
+        self._others: dict[str, np.ndarray] = {}
+
+    def add(self, sums: dict[str, np.ndarray]) -> None:
+        self._moments.append(sums["moments"])
+        for name in sums.keys() - {"moments"}:
+            self._others[name] = self._others.get(name, 0) + sums[name]
+
+    def all(self) -> dict[str, np.ndarray]:
+        return {"moments": np.concatenate(self._moments), **self._others}
+
+
+class Memory:
+    """What a Store is, without files."""
+
+    def __init__(self, variables: Any, coordinates: dict[str, np.ndarray], cases: int, chunk: int):
+        self.variables, self.coordinates = variables, coordinates
+        self.cases, self.chunks = cases, -(-cases // chunk)
+        self._rows: list[dict[str, np.ndarray]] = []
+        self._totals = Totals()
+
+    def has(self, k: int) -> bool:
+        return False
+
+    def write(self, k: int, rows: dict[str, np.ndarray], sums: dict[str, np.ndarray]) -> None:
+        self._rows.append(rows)
+        self._totals.add(sums)
+
+    def totals(self) -> dict[str, np.ndarray]:
+        return self._totals.all()
+
+    def dataset(self, attrs: dict[str, Any]) -> Any:
+        import xarray as xr
+
+        joined = {
+            name: (dims, np.concatenate([rows[name] for rows in self._rows]))
+            for name, (dims, _, _) in self.variables.items()
+        }
+        coords = {"case": np.arange(self.cases), **self.coordinates}
+        return xr.Dataset(joined, coords=coords, attrs=attrs)
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError as e:
+        raise RuntimeError(
+            "a sweep's store needs zarr; install it with pip install 'jaxguide[sweep]'."
+        ) from e
+    return zarr
+
+
+def _digest(values: dict[str, np.ndarray]) -> np.ndarray:
+    sha = hashlib.sha256()
+    for name in sorted(values):
+        sha.update(name.encode())
+        sha.update(np.ascontiguousarray(values[name]).tobytes())
+    return np.frombuffer(sha.digest(), np.uint8)
+
+
+def _same(manifest: dict[str, Any], found: dict[str, Any], path: Path) -> None:
+    flat = lambda d: dict(_leaves(d))
+    ours, theirs = flat(manifest), flat(found)
+    differ = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
+    if differ:
+        told = ", ".join(
+            f"{k} ({_short(theirs.get(k))}, now {_short(ours.get(k))})" for k in differ
+        )
+        raise ValueError(
+            f"{path} was made by another sweep: {told}. Give another directory, or what made it."
+        )
+
+
+def _leaves(d: dict[str, Any], prefix: str = "") -> Any:
+    for key, value in d.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}: ")
+        else:
+            yield prefix + key, value
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return "absent" if value is None else text if len(text) < 20 else text[:8] + "..."
