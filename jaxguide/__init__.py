@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from jaxguide.neighboring.linearization import linearize as linearize
     from jaxguide.nominal.phased import Phased as Phased
     from jaxguide.nominal.phased import PhaseEnds as PhaseEnds
+    from jaxguide.nominal.piecewise_linear import PiecewiseLinear as PiecewiseLinear
     from jaxguide.nominal.pseudospectral import Pseudospectral as Pseudospectral
     from jaxguide.nominal.shooting import Shooting as Shooting
     from jaxguide.problem import Free as Free
@@ -72,6 +73,7 @@ _HOME = {
     "OpenLoop": "laws.law",
     "PhaseEnds": "nominal.phased",
     "Phased": "nominal.phased",
+    "PiecewiseLinear": "nominal.piecewise_linear",
     "Problem": "problem",
     "Pseudospectral": "nominal.pseudospectral",
     "RESULTS": "types",

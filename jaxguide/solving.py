@@ -32,7 +32,7 @@ def solve(
 
     - `problem`: the Problem; its parameters may be traced, so this may be `vmap`ped and
       differentiated (implicitly, forward and reverse).
-    - `method`: `jg.Shooting` or `jg.Pseudospectral`. Default: shooting, the more accurate, unless
+    - `method`: `jg.Shooting`, `jg.Pseudospectral` or `jg.PiecewiseLinear`. Default: shooting, the more accurate, unless
       the Problem has bounds, path constraints or what else shooting cannot do; where shooting
       finds nothing, a direct solution, polished by shooting from there if that succeeds. Under a
       trace bounds cannot be seen: name the method, or look for `bounds_violated`.

@@ -1,0 +1,45 @@
+"""Launch from the Moon into a low orbit in least time: Libby's thesis, chapter 4."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike
+
+from jaxguide.problem import Free, Problem
+from jaxguide.problems.reference import Reference
+from jaxguide.trig import sincos
+
+
+class LunarLaunch(Problem):
+    """Least time from rest to 50,000 ft at 5,444 ft/s, level, by steering a constant thrust.
+
+    Flat Moon, uniform gravity; feet and seconds. State x, y, u, v (downrange, altitude and their
+    rates); control theta, the thrust angle above the horizontal. J = tf. The optimum is the linear
+    tangent law, tan(theta) = 0.48782613 - 0.00159492555 t.
+
+    **Source:** W. A. Libby, *Neighboring Extremal Guidance for Systems with Piecewise Linear
+    Control Using Time as the Reference Variable*, University of Texas, eqs (4.1)-(4.9).
+    """
+
+    thrust: ArrayLike = 20.8  # acceleration, ft/s^2
+    gravity: ArrayLike = 5.32  # ft/s^2
+    orbit: tuple = (50_000.0, 5_444.0, 0.0)  # y [ft], u, v [ft/s] at the end
+    state_names = ("x", "y", "u", "v")
+    control_names = ("theta",)
+    initial_state = (0.0, 0.0, 0.0, 0.0)
+    final_time = Free(1.0, 5000.0, 300.0)
+    reference = Reference(272.706049676, 1e-9, "linear tangent law", "Libby, section 4.1")
+
+    def dynamics(self, t: Any, x: Any, u: Any) -> Any:
+        sin, cos = sincos(u[0])
+        return jnp.stack([x[2], x[3], self.thrust * cos, self.thrust * sin - self.gravity])
+
+    def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        return tf
+
+    def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        y, u, v = self.orbit
+        return jnp.stack([xf[1] - y, xf[2] - u, xf[3] - v])
+
+    def optimal_control(self, t: Any, x: Any, costate: Any) -> Any:
+        return jnp.arctan2(-costate[3], -costate[2])[None]
