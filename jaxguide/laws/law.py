@@ -1,7 +1,7 @@
 """What a guidance law is: a measurement in, a command over the next sample out."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,6 +43,11 @@ class Command(eqx.Module):
     def __call__(self, t: Any) -> Float[Array, " m"]:
         return self.nominal(t) + self.deviation(t)
 
+    @property
+    def time_to_go(self) -> Any:
+        """From the sample to the end that the law expects; None: the mission knows its end."""
+        return None
+
     def nominal_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
         """`nominal` at each stage time; laws prepared on a grid look it up."""
         return tuple(lanes(self.nominal(times[j])) for j in range(times.shape[0]))
@@ -54,6 +59,8 @@ class Command(eqx.Module):
 
 class Law(eqx.Module):
     """A guidance law. `memory` is a pytree of whatever it must remember between samples."""
+
+    decides_end: ClassVar[bool] = False  # whether its commands carry a time to go, to fly to zero
 
     @abc.abstractmethod
     def start(self, x0: Float[Array, " n"]) -> Any:
