@@ -61,7 +61,7 @@ def solve(
         guess = (
             closed(guess) if isinstance(guess, Extremal) and guess.stretch is not None else guess
         )
-    if is_traced((problem, guess)):
+    if is_traced((problem, guess, method)):
         extremal = method(problem, guess, certifier(method.accuracy))
         return opened(extremal) if without_end else extremal
     extremal = _best(method, problem, guess) if direct else _run(method, problem, guess)

@@ -1,6 +1,7 @@
 """Neighbouring suboptimal guidance, with the clock or the time to go as reference (thesis, ch. 4)."""
 
 import abc
+import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -87,11 +88,11 @@ def _blend(stations: Float[Array, " g"], tau: Any) -> Any:
 
 
 class Plan(eqx.Module):
-    """What a law has in mind: its clock runs `offset` behind the flight's, and the correction is
-    `du` at `anchor` on that clock, changing at `slope`."""
+    """What a law has in mind: the nominal's clock runs `offset` behind the flight's, and the
+    correction is `du` at the flight's time `since`, changing at `slope`."""
 
     offset: Float[Array, ""]
-    anchor: Float[Array, ""]
+    since: Float[Array, ""]
     du: Float[Array, " m"]
     slope: Float[Array, " m"]
 
@@ -110,7 +111,7 @@ class SuboptimalCommand(Command):
         return schedule.control(tau).astype(self.plan.du.dtype)
 
     def deviation(self, t: Any) -> Float[Array, " m"]:
-        return self.plan.du + self.plan.slope * (t - self.plan.offset - self.plan.anchor)
+        return self.plan.du + self.plan.slope * (t - self.plan.since)
 
 
 class TimedCommand(SuboptimalCommand):
@@ -124,12 +125,16 @@ class TimedCommand(SuboptimalCommand):
 
 
 def _planned(
-    schedule: SuboptimalSchedule, gains: Gains, offset: Array, anchor: Array, dx: Array
+    schedule: SuboptimalSchedule, gains: Gains, offset: Array, since: Array, dx: Array
 ) -> Plan:
     """Eqs (4.39)-(4.43): from the change here to that at the next node, in a straight line."""
     du, ahead = gains.here.astype(dx.dtype) @ dx, gains.ahead.astype(dx.dtype) @ dx
     slope = (ahead - du) / (gains.spacing * schedule.duration).astype(dx.dtype)
-    return Plan(offset, anchor, du, slope)
+    return Plan(offset, since, du, slope)
+
+
+def _choose(first: Array, a: Plan, b: Plan) -> Plan:
+    return jax.tree_util.tree_map(lambda a, b: jnp.where(first, a, b), a, b)
 
 
 class NeighboringSuboptimal(Law):
@@ -176,7 +181,9 @@ class TimeToGo(Law):
     - `schedule`, `interpolation`: as in `NeighboringSuboptimal`.
     - `window`: how far from where the last one leads the reference time is looked for, in
       fractions of the horizon. If none is found there the plan goes on, and the result says so.
-    - `quiet`: in the last so many units of time nothing is updated: the plan is flown to its end.
+    - `quiet`: in the last so many units of time the correction is not updated, only the time to go:
+      its gains grow without bound, and what they would correct is no longer worth it. Unless it is
+      positive the search may lead past the end, as the thesis's does.
 
     **Error:** the reference time to rounding; it is differentiated as the root it is.
 
@@ -209,14 +216,11 @@ class TimeToGo(Law):
         reference = begin + tau * duration
         dx = x - schedule.state(tau).astype(x.dtype)
         gains = self.interpolation(schedule, tau)
-        fresh = _planned(schedule, gains, t_k - reference, reference, dx)
-        # `<` and not `<=`: without quiet seconds the search may lead past the end.
-        quiet = (1 - guess) * duration < self.quiet
-        plan = jax.tree_util.tree_map(
-            lambda new, old: jnp.where(found & ~quiet, new, old), fresh, memory
-        )
-        left = begin + duration - (t_k - plan.offset)
-        result = RESULTS.where(found | quiet, RESULTS.successful, RESULTS.no_reference_time)
+        fresh = _planned(schedule, gains, t_k - reference, t_k, dx)
+        left = begin + duration - reference  # after a search in vain, as the last one had it
+        held = dataclasses.replace(memory, offset=fresh.offset)
+        plan = _choose(found & (left >= self.quiet), fresh, _choose(found, held, memory))
+        result = RESULTS.where(found, RESULTS.successful, RESULTS.no_reference_time)
         command = TimedCommand(
             schedule=schedule, plan=plan, result=result, saturated=jnp.array(False), left=left
         )
