@@ -52,7 +52,7 @@ def sweep(
     yet; must be None.
 
     **Returns:** variables `initial_state`, `final_state` (case, state), `result` (case,), and
-    `draw:path` for every dispersed leaf; attributes `rollouts_per_s` (warm), `compile_s`,
+    `draw:path` for every dispersed leaf, `final_time` where the law decides it; attributes `rollouts_per_s` (warm), `compile_s`,
     `percentiles` (with confidence bounds), `success_rate` with Wilson bounds, `failures`, and the
     linear covariance beside the sampled one.
 
@@ -118,6 +118,10 @@ def sweep(
         "saturated": (("case",), joined["saturated"]),
         "result": (("case",), joined["code"]),
     }
+    if "final_time" in joined:
+        variables["final_time"] = (("case",), joined["final_time"])
+        times = summarise(joined["final_time"][good][:, None], ("final_time",))
+        attrs["percentiles"] = attrs["percentiles"] | times
     for path, values in joined["draws"].items():
         dims = ("case",) + tuple(f"{path}:{j}" for j in range(values.ndim - 1))
         variables[f"draw:{path}"] = (dims, values)
@@ -187,12 +191,15 @@ def _fly_tile(
         draws = draw(mission, dispersions, k_draw)
         flown = apply(mission, draws)
         flight = simulate(flown, k_noise, "ends", prepared)
+        # The time of the end says something only where the law decides it.
+        ends = {"final_time": flight.final_time} if mission.law.decides_end else {}
         return {
             "initial_state": flown.initial_state,
             "final_state": flight.final_state,
             "saturated": flight.saturated,
             "code": flight.result._value,
             "draws": draws,
+            **ends,
         }
 
     return jax.vmap(fly)(index * tile + jnp.arange(tile))

@@ -5,8 +5,17 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
+from jaxguide.flight.integrators import RungeKutta4
+from jaxguide.flight.mission import Mission
+from jaxguide.laws.holds import History
+from jaxguide.laws.suboptimal import Interpolation, TimeToGo, TimeToGoGains
+from jaxguide.montecarlo.dispersions import Distribution, Normal
+from jaxguide.neighboring.suboptimal import suboptimal_gains
+from jaxguide.nominal.piecewise_linear import PiecewiseLinear
 from jaxguide.problem import Free, Problem
 from jaxguide.problems.reference import Reference
+from jaxguide.solving import solve
+from jaxguide.trajectory import Extremal
 from jaxguide.trig import sincos
 
 
@@ -43,3 +52,37 @@ class LunarLaunch(Problem):
 
     def optimal_control(self, t: Any, x: Any, costate: Any) -> Any:
         return jnp.arctan2(-costate[3], -costate[2])[None]
+
+
+SAMPLE_INTERVAL = 4.0  # s, section 4.5
+POWERS = (0.0, 2.0, 1.0, 1.0)  # x does not matter, y is a position, u and v are velocities
+QUIET = 1.0  # s, in which the correction is no longer updated
+MISS = (100.0, 2.0, 10.0)  # ft, ft/s, ft/s: further off than this is no orbit
+
+
+def mission(
+    extremal: Extremal | None = None,
+    form: Any = "remaining",
+    interpolation: Interpolation | None = None,
+    quiet: float = QUIET,
+    **options: Any,
+) -> Mission:
+    """Closed loop with the time to go as reference, sampled every 4 s, one RK4 step each.
+
+    As it comes: exact gains, scaled by the time to go; the correction rests in the last second.
+    The thesis's: `form="whole", interpolation=LinearGains(), quiet=0.0, miss=None`.
+    """
+    extremal = solve(LunarLaunch(), PiecewiseLinear()) if extremal is None else extremal
+    interpolation = TimeToGoGains(jnp.asarray(POWERS)) if interpolation is None else interpolation
+    law = TimeToGo(suboptimal_gains(extremal, form), interpolation, quiet=quiet)
+    options = {"miss": MISS, "hold": History(), "integrator": RungeKutta4(1)} | options
+    return Mission(extremal.problem, law, extremal.x[0], SAMPLE_INTERVAL, **options)
+
+
+def dispersions() -> dict[str, Distribution]:
+    """Thrust and gravity by 1 per cent, one sigma; 100 ft and 10 ft/s at the start."""
+    return {
+        "plant.thrust": Normal(0.208),
+        "plant.gravity": Normal(0.0532),
+        "initial_state": Normal(jnp.asarray([100.0, 100.0, 10.0, 10.0])),
+    }
