@@ -62,12 +62,12 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "command went on as it was. Widen `window`, or look at this case's dispersion."
     )
     end_not_reached = (
-        "The law had not brought the flight to its end when the latest time or the samples ran out: "
-        "the perturbation is too large, or give the mission a later `final_time`."
+        "The law had not brought the flight to its end when the latest time or the samples ran "
+        "out: the perturbation is too large, or give the mission a later `final_time`."
     )
     missed = (
-        "The flight ended further from its endpoint constraints than `miss` allows: the perturbation "
-        "is too large for the law, or the allowance too small."
+        "The flight ended further from its endpoint constraints than `miss` allows: the "
+        "perturbation is too large for the law, or the allowance too small."
     )
     diverged = (
         "The flight left finite numbers: the plant diverged. Look at this case's dispersion, or "

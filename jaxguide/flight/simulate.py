@@ -13,16 +13,16 @@ from jaxguide.laws.law import Command, Law, SampleGrid
 from jaxguide.problem import bounds_of
 from jaxguide.types import RESULTS
 
-
-# Of the sample interval: a law's time to go below which a flight is done (the thesis's 1e-6 s of 4).
+# Of the sample interval: a law's time to go below which a flight is done (thesis: 1e-6 s of 4).
 END = 2.5e-7
 
 
 class Flight(eqx.Module):
     """What was flown. With `save="ends"` the histories hold the first and last sample only.
 
-    `t` (K+1,), `x` (K+1, n) at sample times and the end (repeated where the law ended early); `u` (K, m) and `commands` (K, m), the
-    control and its deviation as commanded at each sample; `saturated` (): samples at the cap.
+    `t` (K+1,), `x` (K+1, n) at sample times and the end (repeated where the law ended early); `u`
+    (K, m) and `commands` (K, m), the control and its deviation as commanded at each sample;
+    `saturated` (): samples at the cap.
     """
 
     t: Float[Array, " instant"]

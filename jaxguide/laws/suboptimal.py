@@ -1,4 +1,4 @@
-"""Neighbouring suboptimal guidance, with the clock or the time to go as reference (thesis, ch. 4)."""
+"""Neighbouring suboptimal guidance by the clock or by the time to go (thesis, chapter 4)."""
 
 import abc
 import dataclasses
@@ -50,8 +50,8 @@ class LinearGains(Interpolation):
 
 
 class TimeToGoGains(Interpolation):
-    r"""Gains grow without bound as the time to go, $1 - \tau$, goes to zero; what is interpolated is
-    $K (1 - \tau)^p$, which does not, and after the last station it is held.
+    r"""Gains grow without bound as the time to go, $1 - \tau$, goes to zero; what is interpolated
+    is $K (1 - \tau)^p$, which does not, and after the last station it is held.
 
     **Arguments:** `powers` (n,): p of each state: how often it is integrated to become what is
     constrained, plus one (2 for a position, 1 for a velocity, 0 for what does not matter).

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxguide.linalg import solve
 from jaxguide.nominal import parameters as par
 from jaxguide.nominal.equality import KKTPoint, polished
-from jaxguide.problem import Problem, is_free
+from jaxguide.problem import is_free
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced, require_x64
 
@@ -65,8 +65,8 @@ class SuboptimalSchedule(eqx.Module):
 
 
 class Sensitivities(NamedTuple):
-    """From each station: of the end to the state there (Phi^-1) and to the parameters; the second
-    derivatives of the augmented cost G = J + nu^T psi by parameters, and by parameters and state."""
+    """From each station: of the end by the state there (Phi^-1) and by the parameters; the second
+    derivatives of the augmented cost G = J + nu^T psi, by parameters and by them and the state."""
 
     end_state: Float[Array, "g n n"]
     end_parameters: Float[Array, "g n p"]
@@ -137,8 +137,8 @@ def suboptimal_gains(
     if not is_traced(rank) and not np.all(np.asarray(rank) > _RANK):
         i = int(np.argmin(np.asarray(rank)))
         raise ValueError(
-            f"suboptimal_gains: from tau = {float(stations[i]):.6g} on, the remaining parameters do "
-            "not move every endpoint constraint (their rows are dependent): no deviation can be "
+            f"suboptimal_gains: from tau = {float(stations[i]):.6g} on, the remaining parameters "
+            "do not move every endpoint constraint (their rows are dependent): no deviation can be "
             "taken out. Drop the constraint, add nodes after it, or leave out this station."
         )
     return schedule
@@ -267,7 +267,16 @@ def _dependence(D: Float[Array, "q p"]) -> Float[Array, ""]:
 def _remaining(
     extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
 ) -> tuple[Sensitivities, Array]:
-    """Derivatives at the optimum of what follows `tau`, found from the tail of the nominal."""
+    """Derivatives at the optimum of what follows `tau`."""
+    z, active = _optimum(extremal, positions, a, nu, tau, x)
+    return _derivatives(extremal, positions, z.a, z.nu, tau, x, False), active
+
+
+def _optimum(
+    extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
+) -> tuple[KKTPoint, Array]:
+    """What is optimal from `tau` on, from the state `x` there, sought from the tail of the nominal;
+    and which parameters count."""
     problem, m = extremal.problem, extremal.problem.m
     k = positions.shape[0]
     first = par.interval(positions, tau)
@@ -286,8 +295,19 @@ def _remaining(
         return cost + 0.5 * jnp.sum(jnp.where(active, 0.0, b - held) ** 2), e
 
     args = (problem, positions, par.Departure(tau, when, x), a)
-    z = polished(values, KKTPoint(a, nu), args)
-    return _derivatives(extremal, positions, z.a, z.nu, tau, x, False), active
+    return polished(values, KKTPoint(a, nu), args), active
+
+
+@eqx.filter_jit
+def remaining_optimum(
+    extremal: Extremal, stations: Float[Array, " g"], dx: Float[Array, "g n"]
+) -> Float[Array, "g p"]:
+    """The parameters that are optimal from each station on, the state there off by `dx`: what the
+    "remaining" gains are the derivative of. Those of passed nodes stand as they were."""
+    positions = (extremal.breaks - extremal.t[0]) / (extremal.t[-1] - extremal.t[0])
+    a, nu, x = _nominal(extremal, positions, stations)
+    best = lambda tau, x: _optimum(extremal, positions, a, nu, tau, x)[0].a
+    return jax.vmap(best)(stations, x + dx)
 
 
 def _too_few(extremal: Extremal, left: int, q: int, tau: float) -> str:

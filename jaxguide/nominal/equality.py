@@ -86,13 +86,11 @@ def _tangent(d: Derivatives) -> _Tangent:
     return _Tangent(-d.jacobian.T @ solve(gram, d.c), projector, matrix, size)
 
 
-def is_minimum(values: Values, z: KKTPoint, args: Any) -> Bool[Array, ""]:
-    """Second-order sufficiency: the Hessian of the Lagrangian is positive along the constraints."""
-    return cholesky_positive(_tangent(derivatives(values, z.a, args)).matrix)
-
-
-def minimise(values: Values, a: Array, args: Any, iterations: int) -> tuple[KKTPoint, Array]:
-    """A local minimum from `a`, and its KKT residual; both as found, not for differentiation.
+def minimise(
+    values: Values, a: Array, args: Any, iterations: int
+) -> tuple[KKTPoint, Float[Array, ""], Bool[Array, ""]]:
+    """A local minimum from `a`, its KKT residual, and whether the Hessian of the Lagrangian is
+    positive along the constraints there (second-order sufficiency). Not for differentiation.
 
     Each step is normal to the constraints (to c = 0) plus along them (Newton, its matrix shifted
     until positive, so that no maximum or saddle attracts), no longer than one in any scaled
@@ -100,7 +98,7 @@ def minimise(values: Values, a: Array, args: Any, iterations: int) -> tuple[KKTP
     """
 
     def body(carry: tuple) -> tuple:
-        a, _, _, k = carry
+        a, _, _, _, k = carry
         d = derivatives(values, a, args)
         t = _tangent(d)
         shifted = lambda delta: t.matrix + delta * t.projector
@@ -127,14 +125,15 @@ def minimise(values: Values, a: Array, args: Any, iterations: int) -> tuple[KKTP
         error = jnp.where(jnp.isfinite(error), error, jnp.inf)
         done = error <= _SEARCH
         a = jnp.where(done | jnp.isinf(error), a, a + sizes[best] * step)
-        return a, KKTPoint(a, d.nu), error, k + 1
+        return a, KKTPoint(a, d.nu), error, delta == 0, k + 1
 
-    going = lambda c: (c[2] > _SEARCH) & (c[3] < iterations)
+    going = lambda c: (c[2] > _SEARCH) & (c[4] < iterations)
     q = jax.eval_shape(values, a, args)[1].shape[0]
     start = KKTPoint(a, jnp.zeros(q, a.dtype))
-    carry = (a, start, jnp.asarray(1e300, a.dtype), jnp.zeros((), jnp.int32))
-    _, z, error, _ = jax.lax.while_loop(going, body, carry)
-    return z, error
+    far, never = jnp.asarray(1e300, a.dtype), jnp.array(False)
+    carry = (a, start, far, never, jnp.zeros((), jnp.int32))
+    _, z, error, minimal, _ = jax.lax.while_loop(going, body, carry)
+    return z, error, minimal
 
 
 def polished(values: Values, z: KKTPoint, args: Any) -> KKTPoint:

@@ -39,7 +39,7 @@ def unpack(problem: Problem, a: Float[Array, " p"]) -> tuple[Float[Array, "k m"]
 def control_at(
     positions: Float[Array, " k"], controls: Float[Array, "k m"], tau: Any
 ) -> Float[Array, " m"]:
-    """The control at the scalar `tau`, eqs (4.30)-(4.31); beyond the ends the last slope goes on."""
+    """The control at the scalar `tau`, eqs (4.30)-(4.31); past the ends the last slope goes on."""
     i = interval(positions, tau)
     share = (tau - positions[i]) / (positions[i + 1] - positions[i])
     return controls[i] + share * (controls[i + 1] - controls[i])

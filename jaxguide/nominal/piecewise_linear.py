@@ -1,4 +1,4 @@
-"""`jg.PiecewiseLinear`: the control as a parameter vector, optimised to rounding (thesis, ch. 2)."""
+"""`jg.PiecewiseLinear`: the control as a parameter vector, optimised (thesis, chapter 2)."""
 
 import functools
 from typing import Any, NamedTuple
@@ -16,7 +16,6 @@ from jaxguide.nominal.equality import (
     KKTPoint,
     conditions,
     derivatives,
-    is_minimum,
     minimise,
     polished,
 )
@@ -53,8 +52,8 @@ class PiecewiseLinear(eqx.Module):
     - `degree`: of the returned Extremal between nodes, and steps of the flow there.
     - `starts`, `seed`: how many starts without a guess; all but the first random.
 
-    **Error:** KKT residual to 1e-12, scaled; the cost exceeds the optimum by the fourth power of the
-    spacing. H_u = 0 holds on average about each node and not at every time: that row of the
+    **Error:** KKT residual to 1e-12, scaled; the cost exceeds the optimum by the spacing's fourth
+    power. H_u = 0 holds on average about each node and not at every time: that row of the
     certificate fails, by as much as the control is off.
 
     **Raises:** `ValueError` for nodes that are too few, out of order, repeated, or not from 0 to 1.
@@ -142,12 +141,12 @@ class PiecewiseLinear(eqx.Module):
             begin = jax.lax.stop_gradient(self._from_guess(frozen, positions, guess))[None]
         units = jax.vmap(functools.partial(_units, frozen, positions, self.degree))(begin)
 
-        def attempt(a: Array, units: Units) -> tuple[KKTPoint, Array, Array]:
+        def attempt(a: Array, units: Units) -> tuple[KKTPoint, Array, Array, Array]:
             args = (frozen, positions)
-            z, error = minimise(self._values(units), a / units.a, args, _ITERATIONS)
-            return z, error, self._values(units)(z.a, args)[0] * units.f
+            found = minimise(self._values(units), a / units.a, args, _ITERATIONS)
+            return *found, self._values(units)(found[0].a, args)[0] * units.f
 
-        zs, errors, costs = jax.lax.stop_gradient(jax.vmap(attempt)(begin, units))
+        zs, errors, minimal, costs = jax.lax.stop_gradient(jax.vmap(attempt)(begin, units))
         converged = (errors < 1e-6) & jnp.isfinite(costs)
         cheapest = jnp.argmin(jnp.where(converged, costs, jnp.inf))
         best = jnp.where(jnp.any(converged), cheapest, jnp.argmin(errors))
@@ -155,7 +154,6 @@ class PiecewiseLinear(eqx.Module):
         values, args = self._values(units), (problem, self.positions)
         z = polished(values, z, args)
         error = jnp.max(jnp.abs(jnp.concatenate(conditions(values, z, args))))
-        minimal = is_minimum(values, z, args)
         extremal = flown(
             problem,
             self.positions,
@@ -165,7 +163,7 @@ class PiecewiseLinear(eqx.Module):
             degree=self.degree,
             residual=error,
         )
-        result = RESULTS.where(minimal, RESULTS.successful, RESULTS.not_minimising)
+        result = RESULTS.where(minimal[best], RESULTS.successful, RESULTS.not_minimising)
         result = RESULTS.where(_within_bounds(extremal), result, RESULTS.bounds_violated)
         result = RESULTS.where(error <= _TOLERANCE, result, RESULTS.optimiser_stopped)
         return eqx.tree_at(lambda e: e.result, extremal, result)
@@ -189,8 +187,8 @@ class PiecewiseLinear(eqx.Module):
         controls = jnp.asarray(guess, positions.dtype)
         if controls.shape != (positions.shape[0], problem.m):
             raise ValueError(
-                f"guess has shape {controls.shape}; give an Extremal, or the controls at the nodes, "
-                f"shape {(positions.shape[0], problem.m)}."
+                f"guess has shape {controls.shape}; give an Extremal, or the controls at the "
+                f"nodes, shape {(positions.shape[0], problem.m)}."
             )
         return par.pack(problem, controls, start_value(problem.final_time))
 

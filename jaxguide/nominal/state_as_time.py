@@ -40,7 +40,8 @@ class StateAsTime(Problem):
             others = [s for s, ok in zip(states, monotone, strict=True) if ok]
             raise ValueError(
                 f"StateAsTime: {name} is not monotone along the nominal: its rate is "
-                f"{rates[0, i]:.6g} at first and {rates[k, i]:.6g} at t = {float(nominal.t[k]):.6g}. "
+                f"{rates[0, i]:.6g} at first and {rates[k, i]:.6g} at t = "
+                f"{float(nominal.t[k]):.6g}. "
                 + (f"Choose {' or '.join(others)}." if others else "No state of it is; keep time.")
             )
         self.problem, self.name, self.falling = problem, name, bool(rates[0, i] < 0)
