@@ -32,7 +32,7 @@ def launch():
 @pytest.fixture(scope="module")
 def integrator():
     """Nodes anywhere: the optimum, u = 6 - 12 t, is a straight line."""
-    return jg.solve(DoubleIntegrator(), jg.PiecewiseLinear((0.0, 0.2, 0.5, 0.6, 1.0), 4, starts=1))
+    return jg.solve(DoubleIntegrator(), jg.PiecewiseLinear((0.0, 0.2, 0.5, 0.6, 1.0), 5, starts=1))
 
 
 @pytest.fixture(scope="module")
@@ -76,18 +76,19 @@ def test_implicit_derivatives_and_batches():
     np.testing.assert_allclose(slope, -12 / ks**3, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_nodes_are_differentiable(launch):
     """Of the control at each node by the place of one."""
     even = jnp.linspace(0.0, 1.0, 5)
 
-    @jax.jit
     def controls(s):
-        method = jg.PiecewiseLinear(even.at[2].set(s), starts=1)
-        return jg.solve(LunarLaunch(), method, launch, throw=False).u[::8, 0]
+        method = jg.PiecewiseLinear(even.at[2].set(s), 4)
+        return jg.solve(LunarLaunch(), method, launch, throw=False).u[::4, 0]
 
-    _, slope = jax.jvp(controls, (even[2],), (jnp.ones(()),))
+    both = jax.jit(lambda s: jax.jvp(controls, (s,), (jnp.ones(()),)))
+    _, slope = both(even[2])
     h = 1e-4  # truncation of order h^2 = 1e-8, rounding 1e-14/h = 1e-10
-    fd = (controls(even[2] + h) - controls(even[2] - h)) / (2 * h)
+    fd = (both(even[2] + h)[0] - both(even[2] - h)[0]) / (2 * h)
     np.testing.assert_allclose(slope, fd, rtol=0, atol=1e-6 * np.abs(fd).max())
 
 
@@ -110,6 +111,7 @@ def test_gains_of_the_double_integrator(integrator):
     np.testing.assert_allclose(Phi, want, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_gains_with_a_free_final_time(free_time):
     """Linear optimum, linear neighbours: equal to the continuous gains of another method."""
     extremal = jg.solve(FreeTime(), jg.PiecewiseLinear(4, 4, starts=1))
@@ -117,7 +119,7 @@ def test_gains_with_a_free_final_time(free_time):
     schedule = jg.suboptimal_gains(extremal)
     times = schedule.stations * extremal.final_time
     known = jg.gain_schedule(free_time, times)
-    np.testing.assert_allclose(schedule.here, known.K, rtol=1e-7)
+    np.testing.assert_allclose(schedule.here, known.K, rtol=1e-7, atol=1e-12)
     to_go = (1 - schedule.stations)[:, None] * schedule.K_time
     np.testing.assert_allclose(to_go, known.dtf_dx, rtol=1e-7, atol=1e-8)
 
@@ -254,7 +256,13 @@ def test_refuses_problems(launch, free_time):
         jg.solve(DoubleIntegrator(initial_state=(jg.Free(), 0.0)), NINE)
     with pytest.raises(ValueError, match="is an inequality"):
         jg.solve(DoubleIntegrator(endpoint_bounds=(0.0, 1.0)), NINE)
-    at = flown(Placed(), np.linspace(0, 1, 5), launch.u[::16, 0].tolist() + [272.7], None, None)
+    at = flown(
+        Placed(),
+        np.linspace(0, 1, 5),
+        launch.u[::16, 0].tolist() + [272.7],
+        jnp.zeros(4),
+        jg.certify,
+    )
     with pytest.raises(ValueError, match="3 parameters of Placed remain for 4 endpoint constraint"):
         jg.suboptimal_gains(at, stations=(0.0, 0.75))
     with pytest.raises(ValueError, match="no parameter vector; solve with jg.PiecewiseLinear"):

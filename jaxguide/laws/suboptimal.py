@@ -182,8 +182,8 @@ class TimeToGo(Law):
     - `window`: how far from where the last one leads the reference time is looked for, in
       fractions of the horizon. If none is found there the plan goes on, and the result says so.
     - `quiet`: in the last so many units of time the correction is not updated, only the time to go:
-      its gains grow without bound, and what they would correct is no longer worth it. Unless it is
-      positive the search may lead past the end, as the thesis's does.
+      its gains grow without bound, and what they would correct is no longer worth it. With 0 there
+      are none, not even past the end, where the search may lead.
 
     **Error:** the reference time to rounding; it is differentiated as the root it is.
 
@@ -219,7 +219,8 @@ class TimeToGo(Law):
         fresh = _planned(schedule, gains, t_k - reference, t_k, dx)
         left = begin + duration - reference  # after a search in vain, as the last one had it
         held = dataclasses.replace(memory, offset=fresh.offset)
-        plan = _choose(found & (left >= self.quiet), fresh, _choose(found, held, memory))
+        quiet = (left < self.quiet) & (self.quiet > 0)
+        plan = _choose(found & ~quiet, fresh, _choose(found, held, memory))
         result = RESULTS.where(found, RESULTS.successful, RESULTS.no_reference_time)
         command = TimedCommand(
             schedule=schedule, plan=plan, result=result, saturated=jnp.array(False), left=left

@@ -53,8 +53,8 @@ def sweep(
 
     **Returns:** variables `initial_state`, `final_state` (case, state), `result` (case,), and
     `draw:path` for every dispersed leaf, `final_time` where the law decides it; attributes
-    `rollouts_per_s` (warm), `compile_s`, `percentiles` (with confidence bounds), `success_rate` with
-    Wilson bounds, `failures`, and the linear covariance beside the sampled one.
+    `rollouts_per_s` (warm), `compile_s`, `percentiles` (with confidence bounds), `success_rate`
+    with Wilson bounds, `failures`, and the linear covariance beside the sampled one.
 
     **Raises:** `ValueError` for bad arguments.
     """

@@ -1,7 +1,7 @@
 """Neighbouring suboptimal gains: how optimal parameters of a piecewise-linear control change with
 the state met on the way (thesis, chapter 3; Hull & Helfrich)."""
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -89,7 +89,7 @@ class Sensitivities(NamedTuple):
 
 def suboptimal_gains(
     extremal: Extremal,
-    form: Literal["whole", "remaining"] = "remaining",
+    form: str = "remaining",
     stations: Any = None,
 ) -> SuboptimalSchedule:
     """Gains of a piecewise-linear `extremal` (`jg.PiecewiseLinear`).
@@ -179,21 +179,14 @@ def _derivatives(
     problem, degree, p = extremal.problem, extremal.degree, a.shape[0]
     when = None if whole else extremal.t[0] + tau * (extremal.t[-1] - extremal.t[0])
 
-    def outcome(z: Array) -> tuple[Array, Array]:
+    def lagrangian(z: Array) -> tuple[Array, tuple[Array, Array]]:
         start = par.Departure(tau, when, z[p:])
-        return par.outcome(problem, positions, z[:p], start, degree)
-
-    def end(z: Array) -> Array:
-        start = par.Departure(tau, when, z[p:])
-        return par.fly(problem, positions, z[:p], start, degree)[-1, -1, :-1]
+        cost, e, end = par.outcome(problem, positions, z[:p], start, degree)
+        return cost + jnp.dot(nu, e), (e, end)
 
     def slope(z: Array) -> tuple[Array, Array, Array]:
-        def lagrangian(z: Array) -> tuple[Array, Array]:
-            cost, e = outcome(z)
-            return cost + jnp.dot(nu, e), e
-
-        gradient, e = jax.grad(lagrangian, has_aux=True)(z)
-        return gradient[:p], e, end(z)
+        gradient, (e, end) = jax.grad(lagrangian, has_aux=True)(z)
+        return gradient[:p], e, end
 
     G, psi, final = jax.jacfwd(slope)(jnp.concatenate([a, x]))
     return Sensitivities(final[:, p:], final[:, :p], psi[:, p:], psi[:, :p], G[:, :p], G[:, p:])
@@ -237,7 +230,8 @@ def _schedule(
     first = jax.vmap(lambda tau: par.interval(positions, tau))(stations)
     at = lambda i: jax.vmap(lambda K, i: K[i])(K, i)
     points = extremal.reference_nodes
-    powers = points[:, None] ** jnp.arange(points.shape[0] - 1, -1, -1)[None, :]
+    exponents = jnp.arange(points.shape[0] - 1, -1, -1).astype(points.dtype)
+    powers = points[:, None] ** exponents[None, :]
     polynomials = jax.vmap(lambda x: solve(powers, x))(extremal.by_segment(extremal.x))
     schedule = SuboptimalSchedule(
         stations=stations,
@@ -280,17 +274,18 @@ def _optimum(
     problem, m = extremal.problem, extremal.problem.m
     k = positions.shape[0]
     first = par.interval(positions, tau)
-    active = jnp.repeat(jnp.arange(k) >= first, m)
+    order = jnp.arange(k, dtype=first.dtype)
+    active = jnp.repeat(order >= first, m)
     if is_free(problem.final_time):
         active = jnp.append(active, True)
     controls, tf = par.unpack(problem, a)
     here = par.control_at(positions, controls, tau)
-    a = par.pack(problem, jnp.where((jnp.arange(k) == first)[:, None], here, controls), tf)
+    a = par.pack(problem, jnp.where((order == first)[:, None], here, controls), tf)
     when = extremal.t[0] + tau * (extremal.t[-1] - extremal.t[0])
 
     def values(b: Array, args: Any) -> tuple[Array, Array]:
         problem, positions, start, held = args
-        cost, e = par.outcome(problem, positions, b, start, extremal.degree)
+        cost, e, _ = par.outcome(problem, positions, b, start, extremal.degree)
         # A spring on what is passed keeps the system regular and moves nothing.
         return cost + 0.5 * jnp.sum(jnp.where(active, 0.0, b - held) ** 2), e
 

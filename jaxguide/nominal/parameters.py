@@ -93,8 +93,9 @@ def outcome(
     a: Float[Array, " p"],
     start: Departure,
     degree: int,
-) -> tuple[Float[Array, ""], Float[Array, " q"]]:
-    """Cost and endpoint constraints (less their targets) from `start` on, eqs (2.12)-(2.13)."""
+) -> tuple[Float[Array, ""], Float[Array, " q"], Float[Array, " n"]]:
+    """Cost and endpoint constraints (less their targets) from `start` on, eqs (2.12)-(2.13); and
+    the state at the end."""
     end = fly(problem, positions, a, start, degree)[-1, -1]
     t0 = jnp.asarray(problem.initial_time, a.dtype)
     span = unpack(problem, a)[1] - t0
@@ -102,7 +103,7 @@ def outcome(
     ends = (initial_values(problem, a.dtype), end[:-1], t0, begin + (1 - start.tau) * span)
     e = problem.endpoint_constraints(*ends)
     e = e - bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)[0]
-    return problem.endpoint_cost(*ends) + end[-1], e
+    return problem.endpoint_cost(*ends) + end[-1], e, end[:-1]
 
 
 def from_the_start(problem: Problem, dtype: Any) -> Departure:

@@ -174,7 +174,7 @@ class PiecewiseLinear(eqx.Module):
         def values(a: Array, args: tuple[Problem, Array]) -> tuple[Array, Array]:
             problem, positions = args
             start = par.from_the_start(problem, a.dtype)
-            f, c = par.outcome(problem, positions, a * units.a, start, self.degree)
+            f, c, _ = par.outcome(problem, positions, a * units.a, start, self.degree)
             return f / units.f, c / units.c
 
         return values
@@ -207,7 +207,7 @@ def _units(problem: Problem, positions: Array, degree: int, a: Array) -> Units:
     if is_free(problem.final_time):
         size = size.at[-1].set(jnp.maximum(jnp.abs(a[-1]), 1e-8))
     start = par.from_the_start(problem, a.dtype)
-    outcome = lambda a: par.outcome(problem, positions, a * size, start, degree)
+    outcome = lambda a: par.outcome(problem, positions, a * size, start, degree)[:2]
     f, c = jax.jacfwd(outcome)(a / size)
     usable = lambda s: jnp.where(jnp.isfinite(s) & (s > 1e-8), s, 1.0)
     return Units(size, usable(jnp.max(jnp.abs(f))), usable(jnp.max(jnp.abs(c), axis=1)))
@@ -244,7 +244,7 @@ def flown(
     a = jnp.asarray(a, positions.dtype)
     start = par.from_the_start(problem, positions.dtype)
     if nu is None:
-        values = lambda a, _: par.outcome(problem, positions, a, start, degree)
+        values = lambda a, _: par.outcome(problem, positions, a, start, degree)[:2]
         nu = derivatives(values, a, None).nu
     controls, tf = par.unpack(problem, a)
     t0 = jnp.asarray(problem.initial_time, positions.dtype)

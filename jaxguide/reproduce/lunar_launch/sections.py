@@ -25,8 +25,9 @@ def nominal(report: Report, printed: Extremal, converged: Extremal, optimum: Ext
     )
     ends = (printed.final_time, *np.asarray(printed.x[-1]))
     for name, value, wanted in zip(("tf", "x", "y", "u", "v"), ends, paper.END, strict=True):
-        # Half a unit of the last digit; that of tf, of which five are printed, moves x by 0.03 ft.
-        tolerance = 0.03 if name == "x" else 6e-6
+        # The thesis's optimiser stopped at 1e-9 of the scaled constraints, eq. (4.18); tf is
+        # printed to five digits, which leave x uncertain by 0.03 ft.
+        tolerance = {"tf": 6e-6, "x": 0.03, "y": 5e-5}.get(name, 5.5e-6)
         section.add(f"{name} of eq. (5.1)", value, wanted, printed=wanted, tolerance=tolerance)
     section.add("tf, converged", converged.final_time, paper.MINIMISER[0], tolerance=1e-9, unit="s")
     section.add("x(tf)", converged.x[-1, 0], paper.MINIMISER[1], tolerance=1e-3, unit="ft")
@@ -62,7 +63,8 @@ def gain_tables(
         "tf = 272.7060546. Tolerance: 0.6 of the last printed digit."
     )
     away = 0.0
-    for table, rows in (("5.1", paper.TABLE_5_1), ("5.2", paper.TABLE_5_2)):
+    tables: dict[str, dict[int, Any]] = {"5.1": paper.TABLE_5_1, "5.2": paper.TABLE_5_2}
+    for table, rows in tables.items():
         section = report.section(f"Table {table}", text)
         for node, printed in rows.items():
             pairs = printed if table == "5.1" else (printed,)
@@ -176,7 +178,6 @@ def improvements(report: Report, ends: dict[str, Float[np.ndarray, "case 4"]], p
         section.add(f"{name}: extra flight, largest", (end[:, 0] - base[:, 0]).max(), unit="s")
     for name in list(ends)[2:]:
         # Judged from below: at least twenty-fold, root mean square and largest.
-        least = min(rms(base) / rms(ends[name]), *(np.abs(e[:, 1]).max() for e in (base,)))
         least = min(
             rms(base) / rms(ends[name]),
             np.abs(base[:, 1]).max() / np.abs(ends[name][:, 1]).max(),
