@@ -84,9 +84,12 @@ def _compared(seen: dict[str, tuple[np.ndarray, np.ndarray]], table: str, plot: 
 
 
 def _improved(ends: dict[str, np.ndarray], placed: Any, plot: Any) -> Any:
-    figure = plot.Figure(figsize=(plot.WIDTH, 3.2))
-    errors, loss = figure.subplots(1, 2)
-    order = np.argsort([c.percent + (100 if t == "5.4" else 0) for t, c in zip(TABLES, CASES)])
+    figure = plot.Figure(figsize=(plot.WIDTH, 3.4))
+    panels = figure.subplot_mosaic([["errors", "loss"], ["errors", "nodes"]], height_ratios=(6, 1))
+    errors, loss, nodes = panels["errors"], panels["loss"], panels["nodes"]
+    order = np.argsort(
+        [c.percent + (100 if t == "5.4" else 0) for t, c in zip(TABLES, CASES, strict=True)]
+    )
     for k, (name, end) in enumerate(ends.items()):
         values = np.abs(end[order, 1])
         errors.semilogy(values, label=name, marker=plot.MARKERS[k], **plot.line(k))
@@ -99,9 +102,10 @@ def _improved(ends: dict[str, np.ndarray], placed: Any, plot: Any) -> Any:
     loss.set_xlabel("step of Adam")
     loss.set_ylabel("loss over twenty flights [ft$^2$]")
     loss.set_title("Nodes placed by gradient")
-    for tau in placed.positions:
-        loss.plot([tau, tau], [0.02, 0.08], color="#000000", transform=loss.transAxes)
-    loss.text(0.02, 0.1, "nodes, from start to end", transform=loss.transAxes, fontsize=7.0)
+    nodes.vlines(placed.positions, 0.0, 1.0, color=plot.COLOURS[3])
+    nodes.set_yticks([])
+    nodes.grid(False)
+    nodes.set_xlabel("nodes found, fractions of the horizon")
     handles = errors.get_legend_handles_labels()
     figure.legend(*handles, loc="outside upper center", ncols=2)
     return figure
