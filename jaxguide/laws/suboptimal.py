@@ -14,7 +14,7 @@ from jaxguide.laws.law import Command, Law
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
 from jaxguide.types import RESULTS, is_traced
 
-_ITERATIONS = 8  # of the search; Newton doubles the digits of a guess good to a few percent
+_ITERATIONS = 5  # of the search; Newton doubles the digits of a guess good to a few percent
 _FOUND = 1e-9  # of the horizon: the last step of a search that converged
 
 
@@ -236,7 +236,7 @@ class TimeToGo(Law):
 
         frozen, at, middle = jax.lax.stop_gradient((self, x, guess))
         value = lambda tau: change(tau, frozen, at)
-        slope = jax.grad(value)
+        both = lambda tau: jax.jvp(value, (tau,), (jnp.ones_like(tau),))
         # The nominal is known a little past its end, by its last polynomial.
         positions = frozen.schedule.positions
         past = 1 + (1 - positions[-2]).astype(x.dtype) / 4
@@ -248,9 +248,9 @@ class TimeToGo(Law):
 
         def newton(carry: tuple, _: None) -> tuple[tuple, None]:
             tau, low, high, _ = carry
-            off = value(tau)
+            off, slope = both(tau)
             low, high = jnp.where(off < 0, tau, low), jnp.where(off < 0, high, tau)
-            new = tau - off / slope(tau)
+            new = tau - off / slope
             new = jnp.where((new >= low) & (new <= high), new, (low + high) / 2)
             return (new, low, high, jnp.abs(new - tau)), None
 
@@ -260,5 +260,5 @@ class TimeToGo(Law):
         found = bracketed & settled
         tau = jax.lax.stop_gradient(jnp.where(found, tau, middle))
         # One step of Newton more, for its derivatives: those of the root.
-        steep = jax.lax.stop_gradient(jnp.where(found, slope(tau), 1.0))
+        steep = jax.lax.stop_gradient(jnp.where(found, both(tau)[1], 1.0))
         return jnp.where(found, tau - change(tau, self, x) / steep, guess), found
