@@ -247,7 +247,7 @@ class Walled(DoubleIntegrator):
         return x[:1] - 2
 
 
-def test_refuses_problems(launch):
+def test_refuses_problems(launch, integrator):
     with pytest.raises(ValueError, match="2 nodes make 2 parameters, fewer than the 3 endpoint"):
         jg.solve(Overdetermined(), jg.PiecewiseLinear(2))
     with pytest.raises(ValueError, match="path_constraints: 1 of them.*jg.Pseudospectral"):
@@ -267,6 +267,8 @@ def test_refuses_problems(launch):
         jg.suboptimal_gains(few, stations=(0.0, 0.75))
     with pytest.raises(ValueError, match="no parameter vector; solve with jg.PiecewiseLinear"):
         jg.suboptimal_gains(dataclasses.replace(launch, parametric=False))
+    with pytest.raises(ValueError, match="final time of DoubleIntegrator is given"):
+        jg.TimeToGo(jg.suboptimal_gains(integrator, stations=(0.0, 0.2, 0.35, 0.6, 0.9)))
     with pytest.raises(ValueError, match="form is 'part'"):
         jg.suboptimal_gains(launch, "part")
 

@@ -192,7 +192,9 @@ def _advanced(mission: Mission, clock: Clock, to_go: Array) -> Clock:
     step = jnp.minimum(mission.sample_interval, to_go)
     step = jnp.minimum(step, mission.final_time - clock.t)
     step = jnp.where(clock.done, jnp.zeros_like(step), step).astype(clock.t.dtype)
-    arrived = clock.done | (to_go < END * mission.sample_interval)
+    rounding = 8 * jnp.finfo(clock.t.dtype).eps * jnp.abs(mission.final_time)
+    near = jnp.maximum(END * mission.sample_interval, rounding)
+    arrived = clock.done | (to_go < near)
     return Clock(clock.t + step, to_go <= mission.sample_interval, arrived)
 
 

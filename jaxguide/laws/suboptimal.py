@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxguide.laws.law import Command, Law
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
+from jaxguide.problem import is_free
 from jaxguide.types import RESULTS, is_traced
 
 _ITERATIONS = 5  # of the search; Newton doubles the digits of a guess good to a few percent
@@ -198,6 +199,12 @@ class TimeToGo(Law):
     quiet: Any = 0.0
 
     def __check_init__(self):
+        problem = self.schedule.extremal.problem
+        if not is_free(problem.final_time):
+            raise ValueError(
+                f"TimeToGo: the final time of {type(problem).__name__} is given, so that there is "
+                "no time to go to look for; use NeighboringSuboptimal, or make it a jg.Free."
+            )
         if not is_traced(self.window) and not np.all(np.asarray(self.window) > 0):
             raise ValueError(f"TimeToGo: window is {self.window}; give a positive fraction.")
         if not is_traced(self.quiet) and not np.all(np.asarray(self.quiet) >= 0):

@@ -35,7 +35,7 @@ from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS, is_traced
 
 _ITERATIONS = 100
-_TOLERANCE = 1e-10  # scaled KKT residual up to which a solution counts as converged
+_TOLERANCE = 1e-12  # scaled KKT residual up to which a solution counts as converged
 
 
 class PiecewiseLinear(eqx.Module):
