@@ -31,6 +31,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "`max_iterations`, change the mesh, give bounds or a `guess`, or look for a discontinuity "
         "in the dynamics."
     )
+    parameters_not_found = (
+        "Newton on the parameters ended before the KKT conditions were met: give a `guess`, more "
+        "`starts` or other nodes; on a long or unstable horizon, or with bounds, use "
+        "jg.Pseudospectral."
+    )
     infeasible = (
         "No trajectory meets the endpoint constraints: relax a constraint or a bound, or free a "
         "component of the initial state or the final time."

@@ -165,7 +165,7 @@ class PiecewiseLinear(eqx.Module):
         )
         result = RESULTS.where(minimal[best], RESULTS.successful, RESULTS.not_minimising)
         result = RESULTS.where(_within_bounds(extremal), result, RESULTS.bounds_violated)
-        result = RESULTS.where(error <= _TOLERANCE, result, RESULTS.optimiser_stopped)
+        result = RESULTS.where(error <= _TOLERANCE, result, RESULTS.parameters_not_found)
         return eqx.tree_at(lambda e: e.result, extremal, result)
 
     def _values(self, units: "Units") -> Any:
