@@ -127,7 +127,7 @@ def minimise(
         a = jnp.where(done | jnp.isinf(error), a, a + sizes[best] * step)
         return a, KKTPoint(a, d.nu), error, delta == 0, k + 1
 
-    going = lambda c: (c[2] > _SEARCH) & (c[4] < iterations)
+    going = lambda c: (c[2] > _SEARCH) & jnp.isfinite(c[2]) & (c[4] < iterations)
     q = jax.eval_shape(values, a, args)[1].shape[0]
     start = KKTPoint(a, jnp.zeros(q, a.dtype))
     far, never = jnp.asarray(1e300, a.dtype), jnp.array(False)

@@ -53,8 +53,8 @@ class PiecewiseLinear(eqx.Module):
     - `starts`, `seed`: how many starts without a guess; all but the first random.
 
     **Error:** KKT residual to 1e-12, scaled; the cost exceeds the optimum by the spacing's fourth
-    power. H_u = 0 holds on average about each node and not at every time: that row of the
-    certificate fails, by as much as the control is off.
+    power. H_u = 0 holds on average about each node (a row of the certificate) and not at every
+    time: that row fails, by as much as the control is off, and with it those of H pointwise.
 
     **Raises:** `ValueError` for nodes that are too few, out of order, repeated, or not from 0 to 1.
 
