@@ -26,7 +26,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
-from jaxguide.montecarlo.sweep import over_cores  # noqa: E402
+from jaxguide.montecarlo.cores import over_cores  # noqa: E402
 from jaxguide.problems import EarthMars  # noqa: E402
 from jaxguide.problems.earth_mars import mission  # noqa: E402
 
@@ -110,7 +110,8 @@ def main() -> None:
     cores = 2
     schedules = jax.jit(lambda batch: jax.lax.map(lambda e: jg.gain_schedule(e, times).K, batch))
     shares = [jax.tree_util.tree_map(lambda a, i=i: a[i::cores], batch) for i in range(cores)]
-    many = lambda: over_cores(lambda i: jax.block_until_ready(schedules(shares[i])), cores)
+    ready = lambda share: jax.block_until_ready(schedules(share))
+    many = lambda: list(over_cores(ready, shares))
     out["many_schedules"] = {
         "nominals": count,
         "converged": int(np.sum(np.asarray(batch.residual) < 1e-10)),

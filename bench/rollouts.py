@@ -36,7 +36,8 @@ import numpy as np  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
 from jaxguide.flight.simulate import prepare, simulate  # noqa: E402
-from jaxguide.montecarlo.sweep import TILE, compiler_options, over_cores  # noqa: E402
+from jaxguide.montecarlo.cores import over_cores  # noqa: E402
+from jaxguide.montecarlo.tiles import TILE, compiler_options  # noqa: E402
 from jaxguide.problems.earth_mars import dispersions, mission  # noqa: E402
 
 PEERS = Path(os.environ.get("JAXGUIDE_PEERS", Path(__file__).parents[2] / "shared" / "bench"))
@@ -84,9 +85,8 @@ def main() -> None:
     )
     compile_s = time.perf_counter() - began
     shares = [jnp.asarray(part) for part in share]
-    run = lambda: over_cores(
-        lambda i: jax.block_until_ready(compiled(loop, prepared, shares[i])), len(shares)
-    )
+    fly = lambda share: jax.block_until_ready(compiled(loop, prepared, share))
+    run = lambda: list(over_cores(fly, shares))
     run()
     ours, theirs = [], []
     with tempfile.TemporaryDirectory() as folder:

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from jaxguide.laws.law import Law as Law
     from jaxguide.laws.law import OpenLoop as OpenLoop
     from jaxguide.laws.neighboring import NeighboringOptimal as NeighboringOptimal
+    from jaxguide.laws.suboptimal import LinearGains as LinearGains
+    from jaxguide.laws.suboptimal import NeighboringSuboptimal as NeighboringSuboptimal
+    from jaxguide.laws.suboptimal import TimeToGo as TimeToGo
+    from jaxguide.laws.suboptimal import TimeToGoGains as TimeToGoGains
     from jaxguide.montecarlo.covariance import linear_covariance as linear_covariance
     from jaxguide.montecarlo.dispersions import MultivariateNormal as MultivariateNormal
     from jaxguide.montecarlo.dispersions import Normal as Normal
@@ -36,10 +40,14 @@ if TYPE_CHECKING:
     from jaxguide.neighboring.gains import gain_schedule as gain_schedule
     from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
     from jaxguide.neighboring.linearization import linearize as linearize
+    from jaxguide.neighboring.suboptimal import SuboptimalSchedule as SuboptimalSchedule
+    from jaxguide.neighboring.suboptimal import suboptimal_gains as suboptimal_gains
     from jaxguide.nominal.phased import Phased as Phased
     from jaxguide.nominal.phased import PhaseEnds as PhaseEnds
+    from jaxguide.nominal.piecewise_linear import PiecewiseLinear as PiecewiseLinear
     from jaxguide.nominal.pseudospectral import Pseudospectral as Pseudospectral
     from jaxguide.nominal.shooting import Shooting as Shooting
+    from jaxguide.nominal.state_as_time import StateAsTime as StateAsTime
     from jaxguide.problem import Free as Free
     from jaxguide.problem import Problem as Problem
     from jaxguide.solving import solve as solve
@@ -64,20 +72,27 @@ _HOME = {
     "HoldControl": "laws.holds",
     "HoldDeviation": "laws.holds",
     "Law": "laws.law",
+    "LinearGains": "laws.suboptimal",
     "LinearTPBVP": "neighboring.linearization",
     "Mission": "flight.mission",
     "MultivariateNormal": "montecarlo.dispersions",
     "NeighboringOptimal": "laws.neighboring",
+    "NeighboringSuboptimal": "laws.suboptimal",
     "Normal": "montecarlo.dispersions",
     "OpenLoop": "laws.law",
     "PhaseEnds": "nominal.phased",
     "Phased": "nominal.phased",
+    "PiecewiseLinear": "nominal.piecewise_linear",
     "Problem": "problem",
     "Pseudospectral": "nominal.pseudospectral",
     "RESULTS": "types",
     "RungeKutta4": "flight.integrators",
     "Shooting": "nominal.shooting",
     "SolveError": "types",
+    "StateAsTime": "nominal.state_as_time",
+    "SuboptimalSchedule": "neighboring.suboptimal",
+    "TimeToGo": "laws.suboptimal",
+    "TimeToGoGains": "laws.suboptimal",
     "Trajectory": "trajectory",
     "Uniform": "montecarlo.dispersions",
     "bellman": "bellman",
@@ -90,6 +105,7 @@ _HOME = {
     "sincos": "trig",
     "solve": "solving",
     "solve_batch": "batch",
+    "suboptimal_gains": "neighboring.suboptimal",
     "sweep": "montecarlo.sweep",
 }
 _MODULES = ("plotting", "problems", "reproduce")

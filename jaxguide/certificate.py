@@ -259,6 +259,14 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
         problem, t, x, u, costate, held
     )
     rows.add("stationarity H_u", problem.control_names, h_u / h_scale, t, tight)
+    if extremal.parametric:
+        # Of node values: H_u vanishes weighted by the hat function of each node (thesis, eq. 4.33).
+        inside = over(jax.grad(constrained_hamiltonian, argnums=3))(times, gx, gu, glam, gheld)
+        before, after = (quad((1 + sign * gauss)[None, :, None] / 2 * inside) for sign in (-1, 1))
+        none = jnp.zeros_like(before[:1])
+        hats = jnp.concatenate([before, none]) + jnp.concatenate([none, after])
+        hats = hats / (h_scale * (tf - t0))
+        rows.add("stationarity of node values", problem.control_names, hats, breaks, tight)
     h_uu = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
         problem, t, x, u, costate
     )

@@ -358,7 +358,8 @@ def validate(problem: Problem) -> None:
         ("integral_bounds", r),
     ):
         _check_bounds(problem, name, size)
-    t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
+    with jax.ensure_compile_time_eval():  # within a trace of something else, perhaps
+        t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
     free = initially_free(problem)
     for i, name in enumerate(problem.state_names):
         if not np.isfinite(x0[i]):

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxguide.certificate import certifier
 from jaxguide.nominal.diagnosis import why
+from jaxguide.nominal.piecewise_linear import PiecewiseLinear
 from jaxguide.nominal.pseudospectral import Pseudospectral, finished
 from jaxguide.nominal.refinement import refined
 from jaxguide.nominal.shooting import Shooting
@@ -32,9 +33,10 @@ def solve(
 
     - `problem`: the Problem; its parameters may be traced, so this may be `vmap`ped and
       differentiated (implicitly, forward and reverse).
-    - `method`: `jg.Shooting` or `jg.Pseudospectral`. Default: shooting, the more accurate, unless
-      the Problem has bounds, path constraints or what else shooting cannot do; where shooting
-      finds nothing, a direct solution, polished by shooting from there if that succeeds. Under a
+    - `method`: `jg.Shooting`, `jg.Pseudospectral` or `jg.PiecewiseLinear`. Default: shooting, the
+      more accurate, unless the Problem has bounds, path constraints or what else shooting cannot
+      do; where shooting finds nothing, a direct solution, polished by shooting from there if that
+      succeeds. Under a
       trace bounds cannot be seen: name the method, or look for `bounds_violated`.
     - `guess`: None, an Extremal of a similar problem, initial costates (n,) for shooting, or a
       `jax.random.key` for a random start of a direct solve.
@@ -56,7 +58,7 @@ def solve(
     direct = isinstance(method, Pseudospectral)
     without_end = direct and is_endless(problem)
     problem = with_array_leaves(problem)
-    if is_traced((problem, guess)):
+    if is_traced((problem, guess, method)):
         return _traced(method, without_end, problem, guess)
     if without_end:
         problem = endless(problem, method.time_scale)
@@ -164,16 +166,20 @@ def _best(method: Pseudospectral, problem: Problem, guess: Any) -> Extremal:
 
 
 def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
-    if not isinstance(method, Pseudospectral):
+    if isinstance(method, Shooting):
         return _whole(method, problem, guess)
+    if isinstance(method, PiecewiseLinear):
+        return compiled(called, True)(method, problem, guess)
     # In two programs, so that the optimiser's serves every guess and every mesh of its size.
     run = compiled(finished, method.quick)
     return run(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
 
 
-@eqx.filter_jit
-def _whole(method: Any, problem: Problem, guess: Any) -> Extremal:
+def called(method: Any, problem: Problem, guess: Any) -> Extremal:
     return method(problem, guess, certifier(method.accuracy))
+
+
+_whole = eqx.filter_jit(called)
 
 
 @eqx.filter_jit

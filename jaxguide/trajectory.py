@@ -112,6 +112,9 @@ class Extremal(Trajectory):
     # Control and costate may jump at a break: `u` and `costate` hold what follows it.
     u_before: Float[Array, "segment m"] | None = None
     costate_before: Float[Array, "segment n"] | None = None
+    # Whether the control is linear between breaks, its node values optimised: H_u = 0 then holds on
+    # average only, and the control between nodes is the line itself.
+    parametric: bool = eqx.field(static=True, default=False)
 
     def control_by_segment(self) -> Float[Array, "segment p m"]:
         """Nodal controls segment by segment, each with its own end."""
@@ -134,7 +137,7 @@ class Extremal(Trajectory):
         """State, control and costate at `t`, scalar or (T,); held beyond the horizon.
 
         The control comes from H_u = 0 at the interpolated state and costate where that is regular
-        (one Newton step from its interpolant, so an angle stays unwrapped).
+        (one Newton step from its interpolant, so an angle stays unwrapped), unless `parametric`.
         """
         t = jnp.asarray(t, self.t.dtype)
         return jax.vmap(_polished, in_axes=(None, 0))(self, t) if t.ndim else _polished(self, t)
@@ -153,6 +156,8 @@ class Extremal(Trajectory):
 @jax.jit
 def _polished(extremal: Extremal, t: Array) -> Point:
     x, u, costate = extremal.point(t)
+    if extremal.parametric:
+        return Point(x, u, costate)
     t = jnp.clip(t, extremal.t[0], extremal.t[-1])
     return Point(x, polish_control(extremal.problem, t, x, u, costate), costate)
 

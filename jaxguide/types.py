@@ -31,13 +31,18 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "`max_iterations`, change the mesh, give bounds or a `guess`, or look for a discontinuity "
         "in the dynamics."
     )
+    parameters_not_found = (
+        "Newton on the parameters ended before the KKT conditions were met: give a `guess`, more "
+        "`starts` or other nodes; on a long or unstable horizon, or with bounds, use "
+        "jg.Pseudospectral."
+    )
     infeasible = (
         "No trajectory meets the endpoint constraints: relax a constraint or a bound, or free a "
         "component of the initial state or the final time."
     )
     bounds_violated = (
-        "The extremal leaves state, control or path bounds, which indirect shooting does not "
-        "enforce: use a method that does, or widen the bounds."
+        "The extremal leaves state, control or path bounds, which shooting and "
+        "piecewise-linear parameters do not enforce: use a method that does, or widen the bounds."
     )
     not_minimising = (
         "H_uu is not positive definite on the extremal (Legendre-Clebsch): the control does not "
@@ -57,6 +62,18 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     outside_horizon = "Queried outside the nominal horizon; the command was held at its end."
     saturated = "The command was limited to its cap; widen the cap if the authority is there."
+    no_reference_time = (
+        "No time on the nominal has the time to go of this state, within the law's window; the "
+        "command went on as it was. Widen `window`, or look at this case's dispersion."
+    )
+    end_not_reached = (
+        "The law had not brought the flight to its end when the latest time or the samples ran "
+        "out: the perturbation is too large, or give the mission a later `final_time`."
+    )
+    missed = (
+        "The flight ended further from its endpoint constraints than `miss` allows: the "
+        "perturbation is too large for the law, or the allowance too small."
+    )
     diverged = (
         "The flight left finite numbers: the plant diverged. Look at this case's dispersion, or "
         "cap the command."

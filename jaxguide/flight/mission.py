@@ -30,7 +30,11 @@ class Mission(eqx.Module):
     - `estimator`: `start(x0) -> memory`, `estimator(t, y, memory) -> (x, memory)`.
     - `delay`: not yet; must be 0.
     - `disturbance(t, x)`: added to dx/dt.
-    - `initial_time`, `final_time`: default the plant's; a free final time must be given here.
+    - `initial_time`, `final_time`: default the plant's; a free final time must be given here. For
+      a law that decides the end (`law.decides_end`): the latest, default half as long again as its
+      nominal.
+    - `miss`: how far the endpoint constraints may be off, each or all, before a flight counts as
+      `missed`; default: no matter.
     - `max_samples`: static; default from the horizon and the interval.
     - `integrator`: `RungeKutta4(steps)` (fixed steps, for batches) or `Adaptive(tolerance)`.
 
@@ -48,6 +52,7 @@ class Mission(eqx.Module):
     disturbance: Any
     initial_time: Array
     final_time: Array
+    miss: Any
     integrator: Integrator
     max_samples: int = eqx.field(static=True)
 
@@ -66,6 +71,7 @@ class Mission(eqx.Module):
         disturbance: Any = None,
         initial_time: Any = None,
         final_time: Any = None,
+        miss: Any = None,
         max_samples: int | None = None,
         integrator: Integrator | None = None,
     ):
@@ -75,7 +81,8 @@ class Mission(eqx.Module):
                 "leave it 0."
             )
         initial_time = plant.initial_time if initial_time is None else initial_time
-        final_time = plant.final_time if final_time is None else final_time
+        if final_time is None:
+            final_time = _latest(law, initial_time) if law.decides_end else plant.final_time
         for name, value in (("initial_time", initial_time), ("final_time", final_time)):
             if is_free(value):
                 raise ValueError(
@@ -102,6 +109,7 @@ class Mission(eqx.Module):
         self.sensor, self.estimator, self.disturbance = sensor, estimator, disturbance
         self.initial_time = jnp.asarray(initial_time, dtype)
         self.final_time = jnp.asarray(final_time, dtype)
+        self.miss = None if miss is None else jnp.asarray(miss, dtype)
         self.integrator = RungeKutta4() if integrator is None else integrator
         traced = is_traced((self.sample_interval, self.initial_time, self.final_time))
         if not traced:
@@ -110,6 +118,7 @@ class Mission(eqx.Module):
                 float(np.asarray(initial_time)),
                 float(np.asarray(final_time)),
             )
+            count += _LAST_STEPS if law.decides_end else 0
             if max_samples is not None and max_samples < count:
                 raise ValueError(
                     f"Mission: max_samples is {max_samples}, but the horizon holds {count} "
@@ -130,6 +139,13 @@ class Mission(eqx.Module):
                 f"Mission: initial_state has {plant.state_names[i]} = {float(initial_state[i])}; "
                 "give finite numbers."
             )
+
+
+_LAST_STEPS = 8  # shorter and shorter ones, in which a law that decides the end closes in on it
+
+
+def _latest(law: Any, initial_time: Any) -> Any:
+    return initial_time + 1.5 * law.schedule.duration
 
 
 def _sample_count(interval: float, t0: float, tf: float) -> int:

@@ -10,14 +10,19 @@ from jaxtyping import Array, Bool, Float
 from jaxguide.flight.integrators import Adaptive, RungeKutta4, stacked
 from jaxguide.flight.mission import Mission
 from jaxguide.laws.law import Command, Law, SampleGrid
+from jaxguide.problem import bounds_of
 from jaxguide.types import RESULTS
+
+# Of the sample interval: a law's time to go below which a flight is done (thesis: 1e-6 s of 4).
+END = 2.5e-7
 
 
 class Flight(eqx.Module):
     """What was flown. With `save="ends"` the histories hold the first and last sample only.
 
-    `t` (K+1,), `x` (K+1, n) at sample times and the end; `u` (K, m) and `commands` (K, m), the
-    control and its deviation as commanded at each sample; `saturated` (): samples at the cap.
+    `t` (K+1,), `x` (K+1, n) at sample times and the end (repeated where the law ended early); `u`
+    (K, m) and `commands` (K, m), the control and its deviation as commanded at each sample;
+    `saturated` (): samples at the cap.
     """
 
     t: Float[Array, " instant"]
@@ -65,7 +70,8 @@ def simulate(
     `prepared`: `prepare(mission)` if at hand (for batches that share times and law).
 
     **Returns:** a Flight. `.result` is `diverged` where the state left finite numbers (the state is
-    then held at its last finite value), `outside_horizon` where the law was asked past its nominal.
+    then held at its last finite value), `outside_horizon` where the law was asked past its nominal,
+    `end_not_reached` where a law that decides the end did not, `missed` where the end is off.
 
     **Error:** fixed steps: fourth order in sample_interval / steps; Adaptive: its tolerance.
     Differentiable in every leaf of the mission, the sample interval included (between the values
@@ -79,9 +85,7 @@ def simulate(
     law, fixed = mission.law, isinstance(mission.integrator, RungeKutta4)
     x0 = mission.initial_state
 
-    def sample(carry: _Carry, item: tuple) -> tuple[_Carry, Any]:
-        k, t, t_next, stage_times, law_k = item
-        law_k = law if law_k is None else law_k
+    def ask(law_k: Law, carry: _Carry, k: Array, t: Array) -> tuple[Array, Command, Any, Any]:
         x = jnp.stack(carry.x)
         y, estimate = x, carry.estimate
         if mission.sensor is not None:
@@ -89,8 +93,19 @@ def simulate(
         if mission.estimator is not None:
             y, estimate = mission.estimator(t, y, estimate)
         command, memory = law_k(t, y, carry.memory)
+        return x, command, memory, estimate
+
+    def advance(
+        carry: _Carry,
+        asked: tuple[Array, Command, Any, Any],
+        is_last: Array,
+        t: Array,
+        t_next: Array,
+        stage_times: Array,
+        live: Array,
+    ) -> tuple[_Carry, Any]:
+        x, command, memory, estimate = asked
         flown = mission.hold(command, t)
-        is_last = k == mission.max_samples - 1
         if fixed:
             new = _fixed(mission, flown, command, is_last, t, t_next, stage_times, carry.x)
         else:
@@ -100,13 +115,28 @@ def simulate(
         new = tuple(jnp.where(finite, b, a) for a, b in zip(carry.x, new, strict=True))
         result = RESULTS.where(carry.result == RESULTS.successful, command.result, carry.result)
         result = RESULTS.where(finite, result, RESULTS.diverged)
-        live = t_next > t
         saturated = carry.saturated + jnp.where(
             live & command.saturated, jnp.ones((), x.dtype), jnp.zeros((), x.dtype)
         )
         out = (x, flown(t), flown.deviation(t)) if save == "samples" else None
         keep = RESULTS.where(live, result, carry.result)
         return _Carry(new, memory, estimate, saturated, keep), out
+
+    def sample(carry: _Carry, item: tuple) -> tuple[_Carry, Any]:
+        k, t, t_next, stage_times, law_k = item
+        asked = ask(law if law_k is None else law_k, carry, k, t)
+        is_last = k == mission.max_samples - 1
+        return advance(carry, asked, is_last, t, t_next, stage_times, t_next > t)
+
+    def sample_to_go(carry: tuple[_Carry, Clock], k: Array) -> tuple[tuple[_Carry, Clock], Any]:
+        flying, clock = carry
+        t = clock.t
+        asked = ask(law, flying, k, t)
+        clock = _advanced(mission, clock, asked[1].time_to_go)
+        stages = jnp.asarray(mission.integrator.stages or (0.0, 1.0), t.dtype)
+        within = t + (clock.t - t) * stages
+        flying, out = advance(flying, asked, clock.ending, t, clock.t, within, clock.t != t)
+        return (flying, clock), (out, t)
 
     estimate = None if mission.estimator is None else mission.estimator.start(x0)
     start = _Carry(
@@ -117,18 +147,64 @@ def simulate(
         RESULTS.where(jnp.array(True), RESULTS.successful, RESULTS.successful),
     )
     count = jnp.arange(mission.max_samples)
-    items = (count, times[:-1], times[1:], grid.stages, laws)
     # Checkpointed: reverse mode keeps the state at each sample and flies the sample again.
-    body = jax.checkpoint(sample, prevent_cse=False)  # pyright: ignore
-    end, saved = jax.lax.scan(body, start, items)
+    checkpoint = lambda f: jax.checkpoint(f, prevent_cse=False)  # pyright: ignore
+    if law.decides_end:
+        never = jnp.array(False)
+        begin = Clock(mission.initial_time, never, never)
+        (end, clock), (saved, when) = jax.lax.scan(checkpoint(sample_to_go), (start, begin), count)
+        late = ~clock.done & (end.result == RESULTS.successful)
+        result = RESULTS.where(late, RESULTS.end_not_reached, end.result)
+        end = eqx.tree_at(lambda e: e.result, end, result)
+        times = jnp.append(when, clock.t)
+    else:
+        items = (count, times[:-1], times[1:], grid.stages, laws)
+        end, saved = jax.lax.scan(checkpoint(sample), start, items)
     final = jnp.stack(end.x)
+    result = end.result
+    if mission.miss is not None:
+        arrived = result == RESULTS.successful
+        missed = arrived & ~_arrived(mission, x0, final, times[-1])
+        result = RESULTS.where(missed, RESULTS.missed, result)
     if save == "samples":
         xs, us, dus = saved
         t, x = times, jnp.concatenate([xs, final[None]])
     else:
         t, x = jnp.stack([times[0], times[-1]]), jnp.stack([x0, final])
         us = dus = jnp.zeros((1, mission.plant.m), x0.dtype)
-    return Flight(t, x, us, dus, final, times[-1], end.saturated, end.result)
+    return Flight(t, x, us, dus, final, times[-1], end.saturated, result)
+
+
+class Clock(eqx.Module):
+    """Of a flight whose end its law decides."""
+
+    t: Float[Array, ""]
+    ending: Bool[Array, ""]  # this step is meant to be the last
+    done: Bool[Array, ""]
+
+
+def _advanced(mission: Mission, clock: Clock, to_go: Array) -> Clock:
+    """One interval on, or as far as there is to go, until nothing is left; where the law finds
+    itself past its end, once back by that much (thesis, section 4.5).
+
+    What counts as nothing is still flown: the end's derivatives are in it.
+    """
+    step = jnp.minimum(mission.sample_interval, to_go)
+    step = jnp.minimum(step, mission.final_time - clock.t)
+    step = jnp.where(clock.done, jnp.zeros_like(step), step).astype(clock.t.dtype)
+    rounding = 8 * jnp.finfo(clock.t.dtype).eps * jnp.abs(mission.final_time)
+    near = jnp.maximum(END * mission.sample_interval, rounding)
+    arrived = clock.done | (to_go < near)
+    return Clock(clock.t + step, to_go <= mission.sample_interval, arrived)
+
+
+def _arrived(mission: Mission, x0: Array, xf: Array, tf: Array) -> Bool[Array, ""]:
+    """Whether the endpoint constraints hold to within `mission.miss`."""
+    plant = mission.plant
+    e = plant.endpoint_constraints(x0, xf, mission.initial_time, tf)
+    lo, hi = bounds_of(plant.endpoint_bounds, e.shape[0], e.dtype)
+    off = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
+    return jnp.all(off <= jnp.asarray(mission.miss, e.dtype))
 
 
 def sample_times(mission: Mission) -> Float[Array, " instant"]:
@@ -184,9 +260,9 @@ def _adaptive(
 
     assert isinstance(mission.integrator, Adaptive)
     # A sample beyond the end has no length, which an adaptive solver does not take.
-    width = jnp.where(t_next > t, t_next - t, 1.0)
+    width = jnp.where(t_next != t, t_next - t, 1.0)
     final, result = mission.integrator.across(rate, t, t + width, x)
     good = (result == RESULTS.successful) & jnp.all(jnp.isfinite(final))
     final = jnp.where(good, final, jnp.nan)
-    final = jnp.where(t_next > t, final, x)
+    final = jnp.where(t_next != t, final, x)
     return tuple(final[i] for i in range(final.shape[0]))

@@ -55,9 +55,11 @@ class Tally:
         cumulative = np.cumsum(self.histogram[i])
         spread = normal_quantile(0.5 + confidence / 2) * math.sqrt(n * p * (1 - p))
         low, high = math.floor(n * p - spread) - 1, math.ceil(n * p + spread)
-        at = lambda rank: float(self.centre[i] + self.scale[i] * _quantile(cumulative, rank))
+        at = lambda rank: float(self.centre[i] + self.scale[i] * _order_statistic(cumulative, rank))
+        below = math.floor(p * (n - 1))
+        share = p * (n - 1) - below
         return {
-            "value": at(p * (n - 1)),
+            "value": (1 - share) * at(below) + share * at(min(below + 1, n - 1)),
             "low": at(low) if low >= 0 else -math.inf,
             "high": at(high) if high < n else math.inf,
         }
@@ -97,13 +99,12 @@ def _edge(key: Any) -> Any:
     return ((np.asarray(key, np.int64) + _BASE) << (52 - _BITS)).view(float)
 
 
-def _quantile(cumulative: np.ndarray, rank: float) -> float:
-    """The order statistic `rank` (from 0, fractions allowed), even within its bin."""
+def _order_statistic(cumulative: np.ndarray, rank: int) -> float:
+    """The `rank`-th value, from 0, if values are even within its bin."""
     i = int(np.searchsorted(cumulative, rank, side="right"))
     i = min(i, BINS - 1)
     before = cumulative[i - 1] if i else 0
     share = (rank - before + 0.5) / max(cumulative[i] - before, 1)
-    share = min(max(share, 0.0), 1.0)
     if i >= _SPAN:
         a, b = _edge(i - _SPAN), _edge(i - _SPAN + 1)
     else:

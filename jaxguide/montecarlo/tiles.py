@@ -83,10 +83,10 @@ class Tiles:
 
     def fly(self, index: int) -> dict[str, np.ndarray]:
         """Every row of tile `index`; those beyond the last case are cut off."""
+        # What was put on a device is flown there.
         device = index % len(self.devices)
-        with jax.default_device(self.devices[device]):
-            program = _program(jax.default_backend())
-            rows = jax.device_get(program(*self._arguments(index, device)))
+        program = _program(jax.default_backend())
+        rows = jax.device_get(program(*self._arguments(index, device)))
         live = min(self.order.tile, self.order.cases - index * self.order.tile)
         return {name: np.asarray(values)[:live] for name, values in rows.items()}
 

@@ -164,6 +164,11 @@ def gain_schedule(
     """
     require_x64("jg.gain_schedule")
     times = jnp.asarray(times, extremal.t.dtype)
+    if extremal.parametric:
+        raise ValueError(
+            "gain_schedule: the extremal's control is a parameter vector; use "
+            "jg.suboptimal_gains, or solve with another method."
+        )
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}.")
     if segments < 8 or segments % 8:

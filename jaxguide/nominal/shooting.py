@@ -19,6 +19,7 @@ from jaxguide.nominal.conditions import (
     horizon,
 )
 from jaxguide.nominal.control import minimising_control
+from jaxguide.nominal.dopri8 import dopri8
 from jaxguide.nominal.guess import coarse_ends, damped_newton, objective, random_start
 from jaxguide.problem import (
     Problem,
@@ -259,7 +260,8 @@ class Shooting(eqx.Module):
             t0, tf = horizon(problem, z)
             times = t0 + (tf - t0) * fractions
             y = jnp.concatenate([z.starts, jnp.zeros((self.arcs, 1), z.starts.dtype)], axis=1)
-            return jax.vmap(lambda y, ts: _dopri8(problem, y, ts))(y, times[index])
+            rate = lambda t, y: canonical_rates(problem, t, y)
+            return jax.vmap(lambda y, ts: dopri8(rate, y, ts))(y, times[index])
 
         def residual(z: Unknowns, problem: Problem) -> Array:
             return boundary_residual(problem, z, fly(z, problem)[:, -1])
@@ -311,37 +313,6 @@ def _if_finite(new: Unknowns, old: Unknowns) -> Unknowns:
     """`new`, or `old` where Newton met a singular Jacobian: a failure then shows what it missed."""
     ok = jnp.all(jnp.isfinite(jax.flatten_util.ravel_pytree(new)[0]))
     return jax.tree_util.tree_map(lambda a, b: jnp.where(ok, a, b), new, old)
-
-
-def _dopri8(problem: Problem, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:
-    """One Dormand-Prince 8 step between each pair of `times`: differentiable both ways.
-
-    The tableau is Diffrax's; its own `step` loops in a way that has no forward mode. A scan over
-    the stages compiles the right-hand side once.
-    """
-    tableau = diffrax.Dopri8.tableau
-    stages = tableau.num_stages
-    a = np.zeros((stages, stages))
-    for i, row in enumerate(tableau.a_lower):
-        a[i + 1, : i + 1] = row
-    c = np.concatenate([[0.0], tableau.c])
-    a, b, c = (jnp.asarray(v, y.dtype) for v in (a, tableau.b_sol, c))
-
-    def step(y: Array, ends: tuple) -> tuple[Array, Array]:
-        t, h = ends
-
-        def stage(ks: Array, row: tuple) -> tuple[Array, None]:
-            a_i, c_i, i = row
-            k = canonical_rates(problem, t + c_i * h, y + h * (a_i @ ks))
-            return ks.at[i].set(k), None
-
-        ks = jnp.zeros((stages, y.shape[0]), y.dtype)
-        ks, _ = jax.lax.scan(stage, ks, (a, c, jnp.arange(stages)))
-        y = y + h * (b @ ks)
-        return y, y
-
-    _, ys = jax.lax.scan(step, y, (times[:-1], jnp.diff(times)))
-    return jnp.concatenate([y[None], ys])
 
 
 def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"]) -> Array:

@@ -44,6 +44,7 @@ _LIBRARY = {
     "shuttle-reentry": ("shuttle", "ShuttleReentry"),
     "shuttle-reentry-heat": ("shuttle", "ShuttleReentryHeat"),
     "npsat1": ("npsat1", "NPSAT1"),
+    "lunar-launch": ("lunar_launch", "LunarLaunch"),
 }
 
 

@@ -13,6 +13,7 @@ from jaxguide.reproduce.report import Section as Section
 _MODULES = {
     "earth-mars": "jaxguide.reproduce.earth_mars",
     "ps-review": "jaxguide.reproduce.ps_review",
+    "lunar-launch": "jaxguide.reproduce.lunar_launch",
 }
 
 

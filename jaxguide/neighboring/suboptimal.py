@@ -1,0 +1,327 @@
+"""Neighbouring suboptimal gains: how optimal parameters of a piecewise-linear control change with
+the state met on the way (thesis, chapter 3; Hull & Helfrich)."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.linalg import solve
+from jaxguide.nominal import parameters as par
+from jaxguide.nominal.equality import KKTPoint, polished
+from jaxguide.problem import is_free
+from jaxguide.trajectory import Extremal
+from jaxguide.types import is_traced, require_x64
+
+_RANK = 1e-9  # of scaled constraint rows, below which they count as dependent
+
+
+class SuboptimalSchedule(eqx.Module):
+    """Gains about `extremal` for deviations met at `stations`, fractions of the horizon.
+
+    `K` (g, k, m, n): change of the control at each of the k nodes per deviation of the state at
+    each station; a station between nodes replaces the last node passed. `K_time` (g, n): change of
+    the final time as a parameter of the whole horizon; the time to go from the station changes by
+    (1 - tau) of it. A law needs little of `K`: `here` (g, m, n), the change at the station, and
+    `ahead` (g, m, n), that at the next node, `spacing` (g,) of the horizon away.
+    """
+
+    stations: Float[Array, " g"]
+    positions: Float[Array, " k"]
+    controls: Float[Array, "k m"]
+    K: Float[Array, "g k m n"]
+    K_time: Float[Array, "g n"]
+    here: Float[Array, "g m n"]
+    ahead: Float[Array, "g m n"]
+    spacing: Float[Array, " g"]
+    polynomials: Float[Array, "interval p n"]  # of the nominal state, from the highest power down
+    extremal: Extremal
+
+    @property
+    def initial_time(self) -> Float[Array, ""]:
+        return self.extremal.t[0]
+
+    @property
+    def duration(self) -> Float[Array, ""]:
+        """Of the nominal."""
+        return self.extremal.t[-1] - self.extremal.t[0]
+
+    def state(self, tau: Any) -> Float[Array, " n"]:
+        """The nominal state at the scalar `tau`; beyond the ends, its polynomial goes on."""
+        i = par.interval(self.positions, tau)
+        a, b = self.positions[i], self.positions[i + 1]
+        local, terms = (2 * tau - a - b) / (b - a), self.polynomials[i]
+        value = terms[0]
+        for term in terms[1:]:
+            value = value * local + term
+        return value
+
+    def control(self, tau: Any) -> Float[Array, " m"]:
+        """The nominal control at the scalar `tau`; beyond the ends, its line goes on."""
+        return par.control_at(self.positions, self.controls, tau)
+
+
+class Sensitivities(NamedTuple):
+    """From each station: of the end by the state there (Phi^-1) and by the parameters; the second
+    derivatives of the augmented cost G = J + nu^T psi, by parameters and by them and the state."""
+
+    end_state: Float[Array, "g n n"]
+    end_parameters: Float[Array, "g n p"]
+    psi_state: Float[Array, "g q n"]
+    psi_parameters: Float[Array, "g q p"]
+    G_aa: Float[Array, "g p p"]
+    G_ax: Float[Array, "g p n"]
+
+    @property
+    def Phi(self) -> Float[Array, "g n n"]:
+        """Transition matrix of eq. (3.8), dx = Phi dx_f + Psi da: eqs (3.12), (3.14)."""
+        eye = jnp.broadcast_to(jnp.eye(self.end_state.shape[1]), self.end_state.shape)
+        return jax.vmap(solve)(self.end_state, eye)
+
+    @property
+    def Psi(self) -> Float[Array, "g n p"]:
+        """Eqs (3.13), (3.15)."""
+        return -self.Phi @ self.end_parameters
+
+
+def suboptimal_gains(
+    extremal: Extremal,
+    form: str = "remaining",
+    stations: Any = None,
+) -> SuboptimalSchedule:
+    """Gains of a piecewise-linear `extremal` (`jg.PiecewiseLinear`).
+
+    **Arguments:**
+
+    - `form`: "whole" is the thesis's, eq. (3.25): the change of all parameters, those of passed
+      nodes too, that costs least by the second derivatives of the whole trajectory's cost while
+      the end is met; what falls on passed nodes is then discarded, and with it optimality.
+      "remaining": the derivative of the parameters that are optimal from the station on, about
+      their own optimum (a tail of an optimal parameter vector is not quite optimal itself), the
+      change of their gradient with the state included.
+    - `stations` (g,): fractions of the horizon in [0, 1), ascending; default every node from which
+      the end can still be controlled.
+
+    **Error:** rounding, in "remaining" relative to re-optimised parameters.
+
+    **Raises:** `ValueError` for an extremal of another kind; for a station from which fewer
+    parameters remain than there are endpoint constraints, or whose parameters do not move them.
+
+    **Source:** thesis, eqs (3.1)-(3.25); G_aa here is exact.
+    """
+    require_x64("jg.suboptimal_gains")
+    if not extremal.parametric:
+        raise ValueError(
+            "suboptimal_gains: the extremal's control is no parameter vector; solve with "
+            "jg.PiecewiseLinear, or use jg.gain_schedule."
+        )
+    if form not in ("whole", "remaining"):
+        raise ValueError(f"form is {form!r}; choose 'whole' or 'remaining'.")
+    positions = (extremal.breaks - extremal.t[0]) / (extremal.t[-1] - extremal.t[0])
+    q, m = extremal.multipliers.endpoint.shape[0], extremal.problem.m
+    free = is_free(extremal.problem.final_time)
+    k = positions.shape[0]
+    if stations is None:
+        # Node i of 0 ... k - 1 leaves k - i controls to choose.
+        count = min(k - 1, k - -(-(q - free) // m) + 1)
+        if count < 1:
+            raise ValueError(_too_few(extremal, k * m + free, q, 0.0))
+        stations = positions[:count]
+    stations = jnp.asarray(stations, positions.dtype)
+    if not is_traced(stations):
+        _check_stations(extremal, np.asarray(stations), np.asarray(positions), q, m, free)
+    schedule, rank = _schedule(extremal, stations, positions, form == "whole")
+    if not is_traced(rank) and not np.all(np.asarray(rank) > _RANK):
+        i = int(np.argmin(np.asarray(rank)))
+        raise ValueError(
+            f"suboptimal_gains: from tau = {float(stations[i]):.6g} on, the remaining parameters "
+            "do not move every endpoint constraint (their rows are dependent): no deviation can be "
+            "taken out. Drop the constraint, add nodes after it, or leave out this station."
+        )
+    return schedule
+
+
+def sensitivities(
+    extremal: Extremal, stations: Float[Array, " g"], whole: bool = True
+) -> Sensitivities:
+    """First and second derivatives of what follows each station, by autodiff of the flow.
+
+    `whole`: with the Hessian of the whole trajectory at every station, stations moving with tf;
+    else with that of what remains, the clock at the station standing still.
+    """
+    positions = (extremal.breaks - extremal.t[0]) / (extremal.t[-1] - extremal.t[0])
+    a, nu, x = _nominal(extremal, positions, stations)
+    derive = lambda tau, x: _derivatives(extremal, positions, a, nu, tau, x, whole)
+    out = jax.vmap(derive)(stations, x)
+    if whole:
+        start = par.from_the_start(extremal.problem, a.dtype)
+        first = _derivatives(extremal, positions, a, nu, start.tau, start.x, True)
+        out = out._replace(G_aa=jnp.broadcast_to(first.G_aa, out.G_aa.shape))
+    return out
+
+
+def _nominal(
+    extremal: Extremal, positions: Array, stations: Array
+) -> tuple[Array, Array, Float[Array, "g n"]]:
+    step = extremal.reference_nodes.shape[0] - 1
+    a = par.pack(extremal.problem, extremal.u[::step], extremal.t[-1])
+    span = extremal.t[-1] - extremal.t[0]
+    x = jax.vmap(lambda tau: extremal.point(extremal.t[0] + tau * span).x)(stations)
+    return a, extremal.multipliers.endpoint, x
+
+
+def _derivatives(
+    extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array, whole: bool
+) -> Sensitivities:
+    problem, degree, p = extremal.problem, extremal.degree, a.shape[0]
+    when = None if whole else extremal.t[0] + tau * (extremal.t[-1] - extremal.t[0])
+
+    def lagrangian(z: Array) -> tuple[Array, tuple[Array, Array]]:
+        start = par.Departure(tau, when, z[p:])
+        cost, e, end = par.outcome(problem, positions, z[:p], start, degree)
+        return cost + jnp.dot(nu, e), (e, end)
+
+    def slope(z: Array) -> tuple[Array, Array, Array]:
+        gradient, (e, end) = jax.grad(lagrangian, has_aux=True)(z)
+        return gradient[:p], e, end
+
+    G, psi, final = jax.jacfwd(slope)(jnp.concatenate([a, x]))
+    return Sensitivities(final[:, p:], final[:, :p], psi[:, p:], psi[:, :p], G[:, :p], G[:, p:])
+
+
+@eqx.filter_jit
+def _schedule(
+    extremal: Extremal, stations: Array, positions: Array, whole: bool
+) -> tuple[SuboptimalSchedule, Float[Array, " g"]]:
+    problem = extremal.problem
+    a, nu, x = _nominal(extremal, positions, stations)
+    p, q, k, m = a.shape[0], nu.shape[0], positions.shape[0], problem.m
+    free = is_free(problem.final_time)
+
+    if whole:
+        s = sensitivities(extremal, stations, True)
+        active = jnp.ones((stations.shape[0], p), bool)
+        s = s._replace(G_ax=jnp.zeros_like(s.G_ax))
+    else:
+        fit = lambda tau, x: _remaining(extremal, positions, a, nu, tau, x)
+        s, active = jax.vmap(fit)(stations, x)
+
+    def gain(s: Sensitivities, active: Array) -> tuple[Array, Array]:
+        # Parameters that no longer count stay where they are.
+        G = jnp.where(active[:, None] & active[None, :], s.G_aa, 0.0)
+        scale = jnp.max(jnp.abs(G)) + jnp.finfo(G.dtype).tiny
+        G = G + jnp.diag(jnp.where(active, 0.0, scale))
+        D = jnp.where(active[None, :], s.psi_parameters, 0.0)
+        rows = jnp.sqrt(jnp.sum(D**2, axis=1, keepdims=True))
+        rows = jnp.where(rows > 0, rows, 1.0)
+        D, C = D / rows, s.psi_state / rows
+        kkt = jnp.block([[G / scale, D.T], [D, jnp.zeros((q, q), G.dtype)]])
+        right = jnp.concatenate([jnp.where(active[:, None], s.G_ax, 0.0) / scale, C])
+        return -solve(kkt, right)[:p], _dependence(D)
+
+    K, rank = jax.vmap(gain)(s, active)
+    n = problem.n
+    K_time = K[:, -1] if free else jnp.zeros((stations.shape[0], n), K.dtype)
+    K = K[:, : k * m].reshape(-1, k, m, n)
+    controls = par.unpack(problem, a)[0]
+    first = jax.vmap(lambda tau: par.interval(positions, tau))(stations)
+    at = lambda i: jax.vmap(lambda K, i: K[i])(K, i)
+    points = extremal.reference_nodes
+    exponents = jnp.arange(points.shape[0] - 1, -1, -1).astype(points.dtype)
+    powers = points[:, None] ** exponents[None, :]
+    polynomials = jax.vmap(lambda x: solve(powers, x))(extremal.by_segment(extremal.x))
+    schedule = SuboptimalSchedule(
+        stations=stations,
+        positions=positions,
+        controls=controls,
+        K=K,
+        K_time=K_time,
+        here=at(first),
+        ahead=at(first + 1),
+        spacing=positions[first + 1] - stations,
+        polynomials=polynomials,
+        extremal=extremal,
+    )
+    return schedule, rank
+
+
+def _dependence(D: Float[Array, "q p"]) -> Float[Array, ""]:
+    """The least pivot of the Gram matrix of unit rows: 0 where they are dependent."""
+    gram, least = D @ D.T, jnp.ones((), D.dtype)
+    for i in range(D.shape[0]):
+        pivot = gram[i, i]
+        least = jnp.minimum(least, pivot)
+        gram = gram - jnp.outer(gram[:, i], gram[i]) / jnp.where(pivot == 0, 1.0, pivot)
+    return least
+
+
+def _remaining(
+    extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
+) -> tuple[Sensitivities, Array]:
+    """Derivatives at the optimum of what follows `tau`."""
+    z, active = _optimum(extremal, positions, a, nu, tau, x)
+    return _derivatives(extremal, positions, z.a, z.nu, tau, x, False), active
+
+
+def _optimum(
+    extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
+) -> tuple[KKTPoint, Array]:
+    """What is optimal from `tau` on, from the state `x` there, sought from the tail of the nominal;
+    and which parameters count."""
+    problem, m = extremal.problem, extremal.problem.m
+    k = positions.shape[0]
+    first = par.interval(positions, tau)
+    order = jnp.arange(k, dtype=first.dtype)
+    active = jnp.repeat(order >= first, m)
+    if is_free(problem.final_time):
+        active = jnp.append(active, True)
+    controls, tf = par.unpack(problem, a)
+    here = par.control_at(positions, controls, tau)
+    a = par.pack(problem, jnp.where((order == first)[:, None], here, controls), tf)
+    when = extremal.t[0] + tau * (extremal.t[-1] - extremal.t[0])
+
+    def values(b: Array, args: Any) -> tuple[Array, Array]:
+        problem, positions, start, held = args
+        cost, e, _ = par.outcome(problem, positions, b, start, extremal.degree)
+        # A spring on what is passed keeps the system regular and moves nothing.
+        return cost + 0.5 * jnp.sum(jnp.where(active, 0.0, b - held) ** 2), e
+
+    args = (problem, positions, par.Departure(tau, when, x), a)
+    return polished(values, KKTPoint(a, nu), args), active
+
+
+@eqx.filter_jit
+def remaining_optimum(
+    extremal: Extremal, stations: Float[Array, " g"], dx: Float[Array, "g n"]
+) -> Float[Array, "g p"]:
+    """The parameters that are optimal from each station on, the state there off by `dx`: what the
+    "remaining" gains are the derivative of. Those of passed nodes stand as they were."""
+    positions = (extremal.breaks - extremal.t[0]) / (extremal.t[-1] - extremal.t[0])
+    a, nu, x = _nominal(extremal, positions, stations)
+    best = lambda tau, x: _optimum(extremal, positions, a, nu, tau, x)[0].a
+    return jax.vmap(best)(stations, x + dx)
+
+
+def _too_few(extremal: Extremal, left: int, q: int, tau: float) -> str:
+    return (
+        f"suboptimal_gains: from tau = {tau:.6g} on, {left} parameters of "
+        f"{type(extremal.problem).__name__} remain for {q} endpoint constraints: not controllable. "
+        "Leave out this station, or solve with more nodes after it."
+    )
+
+
+def _check_stations(
+    extremal: Extremal, stations: np.ndarray, positions: np.ndarray, q: int, m: int, free: bool
+) -> None:
+    if stations.ndim != 1 or not np.all(np.diff(stations) > 0):
+        raise ValueError(f"stations are {stations}; give a vector of ascending fractions.")
+    if stations[0] < 0 or stations[-1] >= 1:
+        raise ValueError(f"stations span [{stations[0]}, {stations[-1]}]; give them within [0, 1).")
+    for tau in stations:
+        first = int(np.searchsorted(positions, tau, side="right")) - 1
+        left = (len(positions) - first) * m + free
+        if left < q:
+            raise ValueError(_too_few(extremal, left, q, float(tau)))

@@ -1,0 +1,88 @@
+"""Launch from the Moon into a low orbit in least time: Libby's thesis, chapter 4."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike
+
+from jaxguide.flight.integrators import RungeKutta4
+from jaxguide.flight.mission import Mission
+from jaxguide.laws.holds import History
+from jaxguide.laws.suboptimal import Interpolation, TimeToGo, TimeToGoGains
+from jaxguide.montecarlo.dispersions import Distribution, Normal
+from jaxguide.neighboring.suboptimal import suboptimal_gains
+from jaxguide.nominal.piecewise_linear import PiecewiseLinear
+from jaxguide.problem import Free, Problem
+from jaxguide.problems.reference import Reference
+from jaxguide.solving import solve
+from jaxguide.trajectory import Extremal
+from jaxguide.trig import sincos
+
+
+class LunarLaunch(Problem):
+    """Least time from rest to 50,000 ft at 5,444 ft/s, level, by steering a constant thrust.
+
+    Flat Moon, uniform gravity; feet and seconds. State x, y, u, v (downrange, altitude and their
+    rates); control theta, the thrust angle above the horizontal. J = tf. The optimum is the linear
+    tangent law, tan(theta) = 0.48782613 - 0.00159492555 t.
+
+    **Source:** W. A. Libby, *Neighboring Extremal Guidance for Systems with Piecewise Linear
+    Control Using Time as the Reference Variable*, University of Texas, eqs (4.1)-(4.9).
+    """
+
+    thrust: ArrayLike = 20.8  # acceleration, ft/s^2
+    gravity: ArrayLike = 5.32  # ft/s^2
+    orbit: tuple = (50_000.0, 5_444.0, 0.0)  # y [ft], u, v [ft/s] at the end
+    state_names = ("x", "y", "u", "v")
+    control_names = ("theta",)
+    initial_state = (0.0, 0.0, 0.0, 0.0)
+    final_time = Free(1.0, 5000.0, 300.0)
+    reference = Reference(272.706049676, 1e-9, "linear tangent law", "Libby, section 4.1")
+
+    def dynamics(self, t: Any, x: Any, u: Any) -> Any:
+        sin, cos = sincos(u[0])
+        return jnp.stack([x[2], x[3], self.thrust * cos, self.thrust * sin - self.gravity])
+
+    def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        return tf
+
+    def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        y, u, v = self.orbit
+        return jnp.stack([xf[1] - y, xf[2] - u, xf[3] - v])
+
+    def optimal_control(self, t: Any, x: Any, costate: Any) -> Any:
+        return jnp.arctan2(-costate[3], -costate[2])[None]
+
+
+SAMPLE_INTERVAL = 4.0  # s, section 4.5
+POWERS = (0.0, 2.0, 1.0, 1.0)  # x does not matter, y is a position, u and v are velocities
+QUIET = 1.0  # s, in which the correction is no longer updated
+MISS = (100.0, 2.0, 10.0)  # ft, ft/s, ft/s: further off than this is no orbit
+
+
+def mission(
+    extremal: Extremal | None = None,
+    form: Any = "remaining",
+    interpolation: Interpolation | None = None,
+    quiet: float = QUIET,
+    **options: Any,
+) -> Mission:
+    """Closed loop with the time to go as reference, sampled every 4 s, one RK4 step each.
+
+    As it comes: exact gains, scaled by the time to go; the correction rests in the last second.
+    The thesis's: `form="whole", interpolation=LinearGains(), quiet=0.0, miss=None`.
+    """
+    extremal = solve(LunarLaunch(), PiecewiseLinear()) if extremal is None else extremal
+    interpolation = TimeToGoGains(jnp.asarray(POWERS)) if interpolation is None else interpolation
+    law = TimeToGo(suboptimal_gains(extremal, form), interpolation, quiet=quiet)
+    options = {"miss": MISS, "hold": History(), "integrator": RungeKutta4(1)} | options
+    return Mission(extremal.problem, law, extremal.x[0], SAMPLE_INTERVAL, **options)
+
+
+def dispersions() -> dict[str, Distribution]:
+    """Thrust and gravity by 1 per cent, one sigma; 100 ft and 10 ft/s at the start."""
+    return {
+        "plant.thrust": Normal(0.208),
+        "plant.gravity": Normal(0.0532),
+        "initial_state": Normal(jnp.asarray([100.0, 100.0, 10.0, 10.0])),
+    }

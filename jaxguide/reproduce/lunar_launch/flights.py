@@ -1,0 +1,111 @@
+"""The thesis's flights: twenty plants, two laws, and the optimum of each plant."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.certificate import certifier
+from jaxguide.flight.integrators import RungeKutta4
+from jaxguide.flight.mission import Mission
+from jaxguide.flight.simulate import Flight, simulate
+from jaxguide.laws.suboptimal import LinearGains, NeighboringSuboptimal
+from jaxguide.neighboring.suboptimal import suboptimal_gains
+from jaxguide.nominal.parameters import pack
+from jaxguide.nominal.piecewise_linear import PiecewiseLinear, flown
+from jaxguide.nominal.state_as_time import StateAsTime
+from jaxguide.problems.lunar_launch import LunarLaunch, mission
+from jaxguide.reproduce.lunar_launch.published import FINAL_TIME, TABLE_5_3, TABLE_5_4, THETA
+from jaxguide.solving import solve
+from jaxguide.trajectory import Extremal
+
+CASES = TABLE_5_3 + TABLE_5_4
+_NAMES = ["5.3"] * len(TABLE_5_3) + ["5.4"] * len(TABLE_5_4)
+TABLES = tuple(_NAMES)
+# Exact percentages: the printed columns of thrust and gravity are rounded.
+FACTORS = np.array([1 + case.percent / 100 for case in CASES])
+THRUST = np.where(np.array(TABLES) == "5.3", 20.8 * FACTORS, 20.8)
+GRAVITY = np.where(np.array(TABLES) == "5.4", 5.32 * FACTORS, 5.32)
+TARGET = np.array([50_000.0, 5_444.0, 0.0])  # y, u, v
+STEPS = 40  # equal steps of horizontal velocity, Nowack's
+
+
+def printed_nominal() -> Extremal:
+    """Eq. (5.1) flown: not quite the minimiser, and what the printed gains are about."""
+    problem, nodes = LunarLaunch(), np.linspace(0.0, 1.0, len(THETA))
+    fly = lambda a: flown(problem, nodes, a, None, certifier(1e-9))
+    return eqx.filter_jit(fly)(pack(problem, jnp.asarray(THETA)[:, None], FINAL_TIME))
+
+
+def thesis_mission(extremal: Extremal, **options: Any) -> Mission:
+    """Time as reference, chapter 4."""
+    options = {"quiet": 0.0, "miss": None} | options
+    return mission(extremal, "whole", LinearGains(), **options)
+
+
+def nowack_mission(nominal: Extremal) -> Mission:
+    """Horizontal velocity as reference; nine nodes even in it, and the correction held."""
+    problem = StateAsTime(LunarLaunch(), "u", nominal)
+    extremal = solve(problem, PiecewiseLinear())
+    law = NeighboringSuboptimal(suboptimal_gains(extremal, "whole"))
+    end = extremal.final_time
+    options: dict[str, Any] = {"final_time": end, "integrator": RungeKutta4(1)}
+    return Mission(problem, law, extremal.x[0], float(end) / STEPS, **options)
+
+
+@eqx.filter_jit
+def fly_cases(loop: Mission, save: str = "samples") -> Flight:
+    """All twenty plants, batched."""
+
+    def one(thrust: Array, gravity: Array) -> Flight:
+        plant = loop.plant
+        inner = plant.problem if isinstance(plant, StateAsTime) else plant
+        changed = dataclasses.replace(inner, thrust=thrust, gravity=gravity)
+        where = lambda m: m.plant.problem if isinstance(plant, StateAsTime) else m.plant
+        return simulate(eqx.tree_at(where, loop, changed), None, save)
+
+    return jax.vmap(one)(jnp.asarray(THRUST), jnp.asarray(GRAVITY))
+
+
+def ends(flight: Flight, by_velocity: bool = False) -> Float[np.ndarray, "case 4"]:
+    """Final time, and deviations of y, u and v from the target."""
+    final = np.asarray(flight.final_state)
+    if not by_velocity:
+        return np.column_stack([flight.final_time, final[:, 1:] - TARGET])
+    y, v, t = final[:, 1] - TARGET[0], final[:, 2], final[:, 3]
+    return np.column_stack([t, y, np.asarray(flight.final_time) - TARGET[1], v])
+
+
+@eqx.filter_jit
+def optimal_times(nominal: Extremal) -> Float[Array, " case"]:
+    """The nine-node optimum of every plant, from the nominal, batched."""
+
+    def one(thrust: Array, gravity: Array) -> Array:
+        problem = dataclasses.replace(LunarLaunch(), thrust=thrust, gravity=gravity)
+        return solve(problem, PiecewiseLinear(), nominal, throw=False).final_time
+
+    return jax.vmap(one)(jnp.asarray(THRUST), jnp.asarray(GRAVITY))
+
+
+@eqx.filter_jit
+def deviations(loop: Mission, flight: Flight) -> tuple[Array, Array]:
+    """What the law saw: reference time and deviation from the nominal at each sample, by case."""
+    law: Any = loop.law
+    schedule = law.schedule
+
+    def one(flight: Flight) -> tuple[Array, Array]:
+        def sample(memory: Any, item: tuple) -> tuple[Any, tuple[Array, Array]]:
+            t, x = item
+            command, memory = law(t, x, memory)
+            reference = t - command.plan.offset
+            tau = (reference - schedule.initial_time) / schedule.duration
+            return memory, (reference, x - schedule.state(tau))
+
+        items = (flight.t[:-1], flight.x[:-1])
+        return jax.lax.scan(sample, law.start(flight.x[0]), items)[1]
+
+    return jax.vmap(one)(flight)
