@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-from jax.tree_util import tree_map
 
 from jaxguide.montecarlo.cores import over_cores
 from jaxguide.montecarlo.tiles import Order, Tiles
@@ -31,8 +30,7 @@ def over_workers(
             "a sweep on a cluster needs Dask; install it with pip install 'jaxguide[sweep]'."
         ) from e
     with _client(distributed, scheduler) as client:
-        # A plain number of the order, so that workers make it ready once.
-        order = jax.device_get(order)
+        # Scattered, so that a worker makes it ready once.
         sent = client.scatter(order, broadcast=True, hash=False)
         x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
         submit = lambda k: client.submit(
@@ -66,7 +64,8 @@ def _chunk(order: Order, tiles: range, each: int, k: int, x64: bool) -> tuple[in
     """In a worker: flies `tiles`."""
     jax.config.update("jax_enable_x64", x64)
     ready = _ready(_Same(order))
-    rows, sums = ready.chunk(list(over_cores(ready.fly, tiles, len(ready.devices))), each)
+    flown = over_cores(ready.fly, tiles, len(ready.devices))
+    rows, sums = ready.chunk(list(flown), each)
     return k, rows, sums
 
 
@@ -85,4 +84,4 @@ class _Same:
 
 @functools.lru_cache(maxsize=2)
 def _ready(same: _Same) -> Tiles:
-    return Tiles(tree_map(jax.numpy.asarray, same.order))
+    return Tiles(same.order)
