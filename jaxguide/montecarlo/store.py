@@ -116,7 +116,7 @@ class Store:
         """Sums of all chunks: moments tile by tile, the others added up."""
         totals = Totals()
         for k in range(self.chunks):
-            totals.add({name: a[k] for name, a in self.partial.arrays() if name != "digest"})
+            totals.add(k, {name: a[k] for name, a in self.partial.arrays() if name != "digest"})
         return totals.all()
 
     def has(self, k: int) -> bool:
@@ -136,19 +136,20 @@ class Store:
 
 
 class Totals:
-    """Adds up the sums of chunks."""
+    """Adds up the sums of chunks, in whatever order they come."""
 
     def __init__(self):
-        self._moments: list[np.ndarray] = []
+        self._moments: dict[int, np.ndarray] = {}
         self._others: dict[str, np.ndarray] = {}
 
-    def add(self, sums: dict[str, np.ndarray]) -> None:
-        self._moments.append(sums["moments"])
+    def add(self, k: int, sums: dict[str, np.ndarray]) -> None:
+        self._moments[k] = sums["moments"]
         for name in sums.keys() - {"moments"}:
             self._others[name] = self._others.get(name, 0) + sums[name]
 
     def all(self) -> dict[str, np.ndarray]:
-        return {"moments": np.concatenate(self._moments), **self._others}
+        ordered = [self._moments[k] for k in sorted(self._moments)]
+        return {"moments": np.concatenate(ordered), **self._others}
 
 
 class Memory:
@@ -157,15 +158,15 @@ class Memory:
     def __init__(self, variables: Any, coordinates: dict[str, np.ndarray], cases: int, chunk: int):
         self.variables, self.coordinates = variables, coordinates
         self.cases, self.chunks = cases, -(-cases // chunk)
-        self._rows: list[dict[str, np.ndarray]] = []
+        self._rows: dict[int, dict[str, np.ndarray]] = {}
         self._totals = Totals()
 
     def has(self, k: int) -> bool:
         return False
 
     def write(self, k: int, rows: dict[str, np.ndarray], sums: dict[str, np.ndarray]) -> None:
-        self._rows.append(rows)
-        self._totals.add(sums)
+        self._rows[k] = rows
+        self._totals.add(k, sums)
 
     def totals(self) -> dict[str, np.ndarray]:
         return self._totals.all()
@@ -174,7 +175,7 @@ class Memory:
         import xarray as xr
 
         joined = {
-            name: (dims, np.concatenate([rows[name] for rows in self._rows]))
+            name: (dims, np.concatenate([self._rows[k][name] for k in range(self.chunks)]))
             for name, (dims, _, _) in self.variables.items()
         }
         coords = {"case": np.arange(self.cases), **self.coordinates}
