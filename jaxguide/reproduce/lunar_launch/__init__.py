@@ -23,6 +23,7 @@ from jaxguide.reproduce.lunar_launch.flights import (
     fly_cases,
     nowack_mission,
     optimal_times,
+    printed_end,
     printed_nominal,
     thesis_mission,
 )
@@ -64,7 +65,7 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
         with stages("sweep"):
             loop = lunar_launch.mission(converged)
             dataset = sweep(loop, lunar_launch.dispersions(), SWEEP_CASES, 0)
-        sections.nominal(report, printed, converged, optimum)
+        sections.nominal(report, printed_end(printed), converged, optimum)
         sections.convergence(report, excess)
         sections.gain_tables(report, schedule, whole)
         sections.exactness(report, whole, remaining, errors)
