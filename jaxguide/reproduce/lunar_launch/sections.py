@@ -22,7 +22,7 @@ def nominal(report: Report, printed: Flight, converged: Extremal, optimum: Extre
     section = report.section(
         "Nominal, eqs (5.1)-(5.6)",
         "Eq. (5.1) flown, by Runge-Kutta 4 in 40 steps, meets the printed end but is no minimiser; "
-        "its code stopped where the cost is flat. The converged parameters differ by up to 7e-4 rad.",
+        "its code stopped where the cost is flat. Converged parameters differ by up to 7e-4 rad.",
     )
     ends = (printed.final_time, *np.asarray(printed.final_state))
     for name, value, wanted in zip(("tf", "x", "y", "u", "v"), ends, paper.END, strict=True):
