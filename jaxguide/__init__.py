@@ -31,9 +31,13 @@ if TYPE_CHECKING:
     from jaxguide.laws.suboptimal import TimeToGo as TimeToGo
     from jaxguide.laws.suboptimal import TimeToGoGains as TimeToGoGains
     from jaxguide.montecarlo.covariance import linear_covariance as linear_covariance
+    from jaxguide.montecarlo.dispersions import LogNormal as LogNormal
     from jaxguide.montecarlo.dispersions import MultivariateNormal as MultivariateNormal
     from jaxguide.montecarlo.dispersions import Normal as Normal
+    from jaxguide.montecarlo.dispersions import Relative as Relative
+    from jaxguide.montecarlo.dispersions import TruncatedNormal as TruncatedNormal
     from jaxguide.montecarlo.dispersions import Uniform as Uniform
+    from jaxguide.montecarlo.rollouts import rerun as rerun
     from jaxguide.montecarlo.rollouts import rollouts as rollouts
     from jaxguide.montecarlo.sweep import sweep as sweep
     from jaxguide.neighboring.gains import GainSchedule as GainSchedule
@@ -74,6 +78,7 @@ _HOME = {
     "Law": "laws.law",
     "LinearGains": "laws.suboptimal",
     "LinearTPBVP": "neighboring.linearization",
+    "LogNormal": "montecarlo.dispersions",
     "Mission": "flight.mission",
     "MultivariateNormal": "montecarlo.dispersions",
     "NeighboringOptimal": "laws.neighboring",
@@ -86,6 +91,7 @@ _HOME = {
     "Problem": "problem",
     "Pseudospectral": "nominal.pseudospectral",
     "RESULTS": "types",
+    "Relative": "montecarlo.dispersions",
     "RungeKutta4": "flight.integrators",
     "Shooting": "nominal.shooting",
     "SolveError": "types",
@@ -94,12 +100,14 @@ _HOME = {
     "TimeToGo": "laws.suboptimal",
     "TimeToGoGains": "laws.suboptimal",
     "Trajectory": "trajectory",
+    "TruncatedNormal": "montecarlo.dispersions",
     "Uniform": "montecarlo.dispersions",
     "bellman": "bellman",
     "certify": "certificate",
     "gain_schedule": "neighboring.gains",
     "linear_covariance": "montecarlo.covariance",
     "linearize": "neighboring.linearization",
+    "rerun": "montecarlo.rollouts",
     "rollouts": "montecarlo.rollouts",
     "simulate": "flight.simulate",
     "sincos": "trig",

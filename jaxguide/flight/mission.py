@@ -1,5 +1,6 @@
 """Mission: the closed loop as one object."""
 
+import difflib
 import math
 from typing import Any
 
@@ -178,7 +179,10 @@ def with_leaf(tree: Any, path: str, change: Any) -> Any:
                 node = getattr(node, part)
             else:
                 names = [k for k in getattr(node, "__dataclass_fields__", {})]
-                raise ValueError(f"no {part!r} in {path!r}; there are {', '.join(names)}.")
+                near = difflib.get_close_matches(part, names, 1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                there = ", ".join(names)
+                raise ValueError(f"no {part!r} in {path!r}; there are {there}{hint or '.'}")
         return node
 
     leaf = where(tree)

@@ -1,5 +1,7 @@
 """Linear covariance of a closed loop: what the dispersions do to first order."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,12 +10,12 @@ from jaxtyping import Array, Float
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import apply, draw
+from jaxguide.montecarlo.rollouts import apply, draw, spread
 
 
 @eqx.filter_jit
 def linear_covariance(
-    mission: Mission, dispersions: dict[str, Distribution], prepared: Prepared | None = None
+    mission: Mission, dispersions: dict[Any, Distribution], prepared: Prepared | None = None
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Final state of the undispersed flight and the covariance of the final state about it.
 
@@ -33,7 +35,7 @@ def linear_covariance(
     jacobians, final = jax.jacfwd(end, has_aux=True)(zeros)
     n = final.shape[0]
     total = jnp.zeros((n, n), final.dtype)
-    for path, jacobian in jacobians.items():
-        flat = jacobian.reshape(n, -1)
-        total = total + flat @ dispersions[path].covariance(flat.shape[1], final.dtype) @ flat.T
+    for paths, covariance in spread(mission, dispersions):
+        flat = jnp.concatenate([jacobians[path].reshape(n, -1) for path in paths], axis=1)
+        total = total + flat @ covariance.astype(final.dtype) @ flat.T
     return final, total

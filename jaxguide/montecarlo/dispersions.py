@@ -23,6 +23,14 @@ class Distribution(eqx.Module):
     def covariance(self, size: int, dtype: Any) -> Array:
         """Covariance (size, size) of the flattened draw."""
 
+    def deviation(self, key: Array, leaf: Array) -> Array:
+        """One draw for `leaf`: what is added to it."""
+        return self.sample(key, leaf.shape, leaf.dtype)
+
+    def spread(self, leaf: Array) -> Array:
+        """Covariance of the flattened `deviation`."""
+        return self.covariance(leaf.size, leaf.dtype)
+
 
 class Normal(Distribution):
     """Independent normal deviations; `std` and `mean` broadcast to the leaf."""
@@ -59,6 +67,76 @@ class Uniform(Distribution):
     def covariance(self, size: int, dtype: Any) -> Array:
         width = _fit(self.hi, (size,), dtype, "hi") - _fit(self.lo, (size,), dtype, "lo")
         return jnp.diag(width**2 / 12)
+
+
+class TruncatedNormal(Distribution):
+    """Normal deviations of `std` about `mean`, cut off below `lo` and above `hi`."""
+
+    std: Any
+    lo: Any
+    hi: Any
+    mean: Any = 0.0
+
+    def __check_init__(self):
+        if not is_traced(self.std) and not np.all(np.asarray(self.std) > 0):
+            raise ValueError(f"TruncatedNormal: std is {self.std}; give numbers > 0.")
+        if not is_traced((self.lo, self.hi)) and not np.all(np.asarray(self.lo) < self.hi):
+            raise ValueError(f"TruncatedNormal: lo={self.lo} is not below hi={self.hi}.")
+
+    def _standard(self, shape: tuple[int, ...], dtype: Any) -> tuple[Array, ...]:
+        std, mean = _fit(self.std, shape, dtype, "std"), _fit(self.mean, shape, dtype, "mean")
+        lo, hi = _fit(self.lo, shape, dtype, "lo"), _fit(self.hi, shape, dtype, "hi")
+        return std, mean, (lo - mean) / std, (hi - mean) / std
+
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        std, mean, a, b = self._standard(shape, dtype)
+        return mean + std * jax.random.truncated_normal(key, a, b, shape, dtype)
+
+    def covariance(self, size: int, dtype: Any) -> Array:
+        std, _, a, b = self._standard((size,), dtype)
+        pdf, cdf = jax.scipy.stats.norm.pdf, jax.scipy.stats.norm.cdf
+        end = lambda z: jnp.where(jnp.isfinite(z), z, 0.0) * pdf(z)
+        inside = cdf(b) - cdf(a)
+        shift = (pdf(a) - pdf(b)) / inside
+        return jnp.diag(std**2 * (1 + (end(a) - end(b)) / inside - shift**2))
+
+
+class LogNormal(Distribution):
+    r"""Deviations $e^{\sigma z} - 1$, z standard normal: within `Relative`, a factor $e^{\sigma z}$
+    on the leaf."""
+
+    sigma: Any
+
+    def __check_init__(self):
+        if not is_traced(self.sigma) and not np.all(np.asarray(self.sigma) >= 0):
+            raise ValueError(f"LogNormal: sigma is {self.sigma}; give numbers >= 0.")
+
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        sigma = _fit(self.sigma, shape, dtype, "sigma")
+        return jnp.expm1(sigma * jax.random.normal(key, shape, dtype))
+
+    def covariance(self, size: int, dtype: Any) -> Array:
+        square = _fit(self.sigma, (size,), dtype, "sigma") ** 2
+        return jnp.diag(jnp.expm1(square) * jnp.exp(square))
+
+
+class Relative(Distribution):
+    """What `distribution` draws, times the leaf: `Relative(Normal(0.01))` is one per cent."""
+
+    distribution: Distribution
+
+    def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        return self.distribution.sample(key, shape, dtype)
+
+    def covariance(self, size: int, dtype: Any) -> Array:
+        return self.distribution.covariance(size, dtype)
+
+    def deviation(self, key: Array, leaf: Array) -> Array:
+        return leaf * self.distribution.deviation(key, leaf)
+
+    def spread(self, leaf: Array) -> Array:
+        size = leaf.reshape(-1)
+        return size[:, None] * self.distribution.spread(leaf) * size[None, :]
 
 
 class MultivariateNormal(Distribution):

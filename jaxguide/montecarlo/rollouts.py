@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission, with_leaf
@@ -11,17 +12,47 @@ from jaxguide.flight.simulate import Flight, Prepared, prepare, simulate
 from jaxguide.montecarlo.dispersions import Distribution
 
 
-def draw(mission: Mission, dispersions: dict[str, Distribution], key: Array) -> dict[str, Array]:
+def draw(mission: Mission, dispersions: dict[Any, Distribution], key: Array) -> dict[str, Array]:
     """One case's deviations, by path. Each path has its own stream, so adding one moves no other.
 
-    **Raises:** `ValueError` for a path that is not one array of the mission.
+    A tuple of paths is drawn as one vector, their leaves one after another, so that they may be
+    correlated (`jg.MultivariateNormal`).
+
+    **Raises:** `ValueError` for a path that is not one array of the mission, or that comes twice.
     """
-    draws = {}
-    for path, distribution in sorted(dispersions.items()):
-        leaf = _leaf(mission, path)
-        stream = jax.random.fold_in(key, _hash(path))
-        draws[path] = distribution.sample(stream, leaf.shape, leaf.dtype)
+    draws: dict[str, Array] = {}
+    for paths, distribution in _ordered(dispersions):
+        leaves = [_leaf(mission, path) for path in paths]
+        stream = jax.random.fold_in(key, _hash(" ".join(paths)))
+        if len(paths) == 1:
+            parts = [distribution.deviation(stream, leaves[0])]
+        else:
+            joined = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+            cuts = np.cumsum([leaf.size for leaf in leaves])[:-1]
+            parts = jnp.split(distribution.deviation(stream, joined), cuts)
+        for path, leaf, part in zip(paths, leaves, parts, strict=True):
+            if path in draws:
+                raise ValueError(f"dispersions: {path!r} is drawn twice; name each leaf once.")
+            draws[path] = part.reshape(leaf.shape)
     return draws
+
+
+def spread(mission: Mission, dispersions: dict[Any, Distribution]) -> list[tuple]:
+    """(paths, covariance of their flattened deviations) of each dispersion."""
+    out = []
+    for paths, distribution in _ordered(dispersions):
+        leaves = [_leaf(mission, path) for path in paths]
+        whole = leaves[0]
+        if len(paths) > 1:
+            whole = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+        out.append((paths, distribution.spread(whole)))
+    return out
+
+
+def _ordered(dispersions: dict[Any, Distribution]) -> list[tuple[tuple[str, ...], Distribution]]:
+    """By their paths, each a tuple."""
+    named = {(k,) if isinstance(k, str) else tuple(k): v for k, v in dispersions.items()}
+    return sorted(named.items(), key=lambda item: item[0])
 
 
 def apply(mission: Mission, draws: dict[str, Array]) -> Mission:
@@ -33,15 +64,15 @@ def apply(mission: Mission, draws: dict[str, Array]) -> Mission:
 
 def rollouts(
     mission: Mission,
-    dispersions: dict[str, Distribution],
+    dispersions: dict[Any, Distribution],
     keys: Array,
     save: str = "ends",
 ) -> Flight:
     """Flies one dispersed case per key.
 
     **Arguments:** `dispersions`: dotted path in the mission ("initial_state", "plant.thrust",
-    "sensor.noise") -> distribution of the deviation; `keys` (B,): one PRNG key a case; `save`:
-    "ends" (default) or "samples".
+    "sensor.noise"), or several as a tuple -> distribution of the deviation; `keys` (B,): one PRNG
+    key a case; `save`: "ends" (default) or "samples".
 
     **Returns:** a Flight whose arrays have a leading case axis. A case that fails is marked in its
     own `.result`; the others are untouched.
@@ -57,10 +88,26 @@ def rollouts(
     return jax.vmap(fly)(keys)
 
 
-def shared(mission: Mission, dispersions: dict[str, Distribution]) -> Prepared | None:
+def case_key(seed: Any, case: Any) -> Array:
+    """The PRNG key of case `case` of a sweep: (seed, case) and nothing else."""
+    key = seed if isinstance(seed, jax.Array) else jax.random.key(seed)
+    return jax.random.fold_in(key, case)
+
+
+def rerun(mission: Mission, dispersions: dict[Any, Distribution], seed: int, case: int) -> Flight:
+    """Flies case `case` of a sweep with this `seed` again, with its history.
+
+    **Error:** a sweep's program may round differently: its final state to 1e-12 or so, relative.
+    """
+    k_draw, k_noise = jax.random.split(case_key(seed, case))
+    flown = apply(mission, draw(mission, dispersions, k_draw))
+    return simulate(flown, k_noise, "samples", shared(mission, dispersions))
+
+
+def shared(mission: Mission, dispersions: dict[Any, Distribution]) -> Prepared | None:
     """What all cases have in common, unless the law or its times are themselves dispersed."""
     own = ("law", "sample_interval", "initial_time", "final_time")
-    if any(path.split(".")[0] in own for path in dispersions):
+    if any(path.split(".")[0] in own for paths, _ in _ordered(dispersions) for path in paths):
         return None
     return prepare(mission)
 

@@ -14,7 +14,7 @@ from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
 from jaxguide.montecarlo.covariance import linear_covariance
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import apply, draw, shared
+from jaxguide.montecarlo.rollouts import apply, case_key, draw, shared
 from jaxguide.montecarlo.tally import BINS, count_in, tile_moments
 from jaxguide.types import RESULTS
 
@@ -26,7 +26,7 @@ class Order(NamedTuple):
     """What is to be flown: all that a case's bits depend on, and how many cases there are."""
 
     mission: Mission
-    dispersions: dict[str, Distribution]
+    dispersions: dict[Any, Distribution]
     seed: int
     cases: int
     tile: int
@@ -111,12 +111,6 @@ class Tiles:
         return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, sums
 
 
-def case_key(seed: Any, case: Any) -> Array:
-    """The PRNG key of case `case`: (seed, case) and nothing else."""
-    key = seed if isinstance(seed, jax.Array) else jax.random.key(seed)
-    return jax.random.fold_in(key, case)
-
-
 def compiler_options() -> dict[str, Any]:
     """What XLA should do for flights: on CPU, use the full width of the vector units."""
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
@@ -142,7 +136,7 @@ def _program(backend: str) -> Any:
 
 def _fly_tile(
     mission: Mission,
-    dispersions: dict[str, Distribution],
+    dispersions: dict[Any, Distribution],
     prepared: Prepared | None,
     key: Array,
     index: Array,
