@@ -309,7 +309,11 @@ def fly(name: str, *, out: Path | None = None, common: Common = Common()) -> Out
     return Outcome(data, shown, result["ok"])
 
 
-@app.command
+sweeps = App(name="sweep")
+app.command(sweeps)
+
+
+@sweeps.default
 def sweep(
     name: str,
     *,
@@ -319,6 +323,7 @@ def sweep(
     resume: bool = False,
     scheduler: str | None = None,
     dtype: Literal["float64", "float32"] = "float64",
+    keep: Literal["all", "summary"] = "all",
     out: Path | None = None,
     common: Common = Common(),
 ) -> Outcome:
@@ -342,6 +347,8 @@ def sweep(
         Address of a Dask scheduler.
     dtype
         Precision of the flights; the nominal and its gains are always float64.
+    keep
+        "summary" keeps statistics and each case's result alone, for millions of cases.
     out
         Folder for the figure.
     """
@@ -355,13 +362,12 @@ def sweep(
         mission, dispersions = library.mission(name), library.dispersions(name)
     import jaxguide as jg
 
-    progress = RichProgress(f"sweep {name}")
+    progress = RichProgress(f"sweep {name}", total=cases, unit="flights")
     options: dict[str, Any] = {"store": store, "scheduler": scheduler, "dtype": dtype}
-    if resume:
-        options["resume"] = True
+    options |= {"keep": keep, "label": name, "resume": resume}
     dataset = jg.sweep(mission, dispersions, cases, seed, progress=progress, **options)
     figures = []
-    if out is not None:
+    if out is not None and keep == "all":
         from jaxguide.plotting import plot_sweep
 
         figures = [_save(plot_sweep(dataset), out, f"{name}-sweep")]
@@ -372,6 +378,56 @@ def sweep(
         if key != "figures":
             table.add_row(key, Text(f"{value:.6g}" if isinstance(value, float) else str(value)))
     return Outcome(data, [table, *_written(figures)])
+
+
+@sweeps.command
+def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = Common()) -> Outcome:
+    """Fly one case of a stored sweep again, with its history.
+
+    Exits with 1 if its end is not the stored one to 1e-12 of its size.
+
+    Parameters
+    ----------
+    store
+        Zarr store of a sweep of a named mission.
+    case
+        Its number, from 0.
+    out
+        Folder for the figure.
+    """
+    from jaxguide import problems as library
+    from jaxguide.montecarlo.store import stored
+
+    told, of_case = stored(store, case)
+    name = told["label"]
+    with waiting(RichProgress(f"mission {name}")):
+        mission, dispersions = library.mission(name), library.dispersions(name)
+    import numpy as np
+
+    import jaxguide as jg
+    from jaxguide.montecarlo.sweep import cast
+
+    flight = jg.rerun(cast(mission, told["dtype"]), dispersions, told["seed"], case)
+    states = library.get(name).state_names
+    figures = []
+    if out is not None:
+        from jaxguide.plotting import plot_flight
+
+        picture = plot_flight(flight, _solved(name)[1])
+        figures = [_save(picture, out, f"{name}-case-{case}")]
+    final = np.asarray(flight.final_state)
+    was = of_case.get("final_state", final)
+    rounding = 1e-12 if told["dtype"] == "float64" else 1e-4
+    same = bool(np.all(np.abs(final - was) <= rounding * np.maximum(1.0, np.abs(was))))
+    data = {
+        "problem": name, "case": case, "seed": told["seed"], "t": flight.t, "x": flight.x,
+        "u": flight.u, "final_state": final, "stored": was, "same": same, "figures": figures,
+        "result": _result(flight.result),
+    }  # fmt: skip
+    table = Table("", "flown again", "stored", box=None)
+    for state, new, old in zip(states, final, was, strict=True):
+        table.add_row(state, f"{float(new):.15g}", f"{float(old):.15g}")
+    return Outcome(data, [table, *_written(figures)], same)
 
 
 @app.command
@@ -393,7 +449,7 @@ def doctor(*, common: Common = Common()) -> Outcome:
     return Outcome({"ok": ok, "checks": checks}, [table], ok)
 
 
-COMMANDS = (problems, reproduce, solve, gains, fly, sweep, doctor)
+COMMANDS = (problems, reproduce, solve, gains, fly, sweep, rerun, doctor)
 
 
 def _solved(name: str, watch: Any = None) -> tuple[Any, Any]:

@@ -18,6 +18,7 @@ import pytest
 from conftest import DoubleIntegrator
 
 import jaxguide as jg
+from jaxguide.montecarlo.store import stored
 
 zarr = pytest.importorskip("zarr")
 
@@ -117,6 +118,21 @@ def test_other_sweeps_are_refused(mission, tmp_path):
     with pytest.raises(ValueError, match="holds files but no sweep"):
         flown(mission, store=tmp_path / "b")
     assert (tmp_path / "b" / "notes.txt").read_text() == "mine"
+
+
+def test_one_stored_case(mission, whole, tmp_path):
+    store = tmp_path / "a"
+    flown(mission, store=store, chunk=16, label="mine")
+    told, case = stored(store, 37)
+    assert (told["label"], told["seed"], told["dtype"]) == ("mine", 7, "float64")
+    np.testing.assert_array_equal(case["final_state"], whole.final_state.values[37])
+    with pytest.raises(ValueError, match="case is 100; .* has 0 to 99"):
+        stored(store, 100)
+    with pytest.raises(ValueError, match="holds no sweep"):
+        stored(tmp_path, 0)
+    flown(mission, store=tmp_path / "b")
+    with pytest.raises(ValueError, match="of no mission of the library; call jg.rerun"):
+        stored(tmp_path / "b", 0)
 
 
 def test_a_store_that_cannot_be_written(mission, tmp_path):

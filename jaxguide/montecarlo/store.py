@@ -135,6 +135,28 @@ class Store:
         return lazy.drop_attrs().assign_attrs(attrs).assign_coords(case=np.arange(self.cases))
 
 
+def stored(path: Path, case: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What the sweep at `path` was, and what it keeps of `case`.
+
+    **Raises:** `ValueError` where there is none, or none of a named mission.
+    """
+    described = Path(path) / "zarr.json"
+    told = json.loads(described.read_text()).get("attributes", {}) if described.exists() else {}
+    manifest = told.get("sweep")
+    if manifest is None:
+        raise ValueError(f"{path} holds no sweep.")
+    if manifest.get("label") is None:
+        raise ValueError(
+            f"{path} is of no mission of the library; call jg.rerun(mission, dispersions, seed, "
+            "case) with its own."
+        )
+    if not 0 <= case < manifest["cases"]:
+        raise ValueError(f"case is {case}; {path} has 0 to {manifest['cases'] - 1}.")
+    root = _zarr().open_group(path, mode="r")
+    rows = {name: a[case] for name, a in root.arrays() if a.shape[:1] == (manifest["cases"],)}
+    return manifest, rows
+
+
 class Totals:
     """Adds up the sums of chunks, in whatever order they come."""
 

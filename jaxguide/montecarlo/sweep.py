@@ -45,6 +45,7 @@ def sweep(
     chunk: int = CHUNK,
     tile: int = TILE,
     devices: Any = None,
+    label: str | None = None,
     progress: Any = None,
 ) -> "xarray.Dataset":
     """Flies `cases` dispersed missions and returns them as an xarray Dataset.
@@ -66,6 +67,7 @@ def sweep(
     - `keep`: "all", or "summary": statistics and each case's result alone.
     - `chunk`: cases written at once, rounded up to whole tiles. `devices`: JAX devices to fly on
       (default all local ones). `progress`: an object with init, step, close.
+    - `label`: a name that the store keeps.
 
     **Returns:** variables `initial_state`, `final_state` (case, state), `saturated`, `result`
     (case,), `draw:path` for every dispersed leaf, `final_time` where the law decides it; attributes
@@ -99,7 +101,7 @@ def sweep(
             )
         book: Any = Memory(variables, coordinates, cases, each * tile)
     else:
-        described = manifest(order) | {"keep": keep}
+        described = manifest(order) | {"keep": keep, "label": label}
         book = Store(Path(store), described, variables, coordinates, each * tile, resume)
     todo = [k for k in range(-(-tiles.count // each)) if not book.has(k)]
 
