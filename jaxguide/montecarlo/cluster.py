@@ -29,23 +29,31 @@ def over_workers(
         raise RuntimeError(
             "a sweep on a cluster needs Dask; install it with pip install 'jaxguide[sweep]'."
         ) from e
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
     with _client(distributed, scheduler) as client:
-        # Scattered, so that a worker makes it ready once.
-        sent = client.scatter(order, broadcast=True, hash=False)
-        x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore
+        # Scattered, so that a worker makes it ready once; anew where all copies were lost.
+        send = lambda: client.scatter(order, broadcast=True, hash=False)
+        sent = send()
         submit = lambda k: client.submit(
             _chunk, sent, chunks[k], each, k, x64, retries=_RETRIES, pure=False
         )
         left = iter(chunks)
         room = _AHEAD * max(len(client.scheduler_info()["workers"]), 1)
-        coming = distributed.as_completed(
-            [submit(k) for k in itertools.islice(left, room)], with_results=True
-        )
-        for future, result in coming:
-            yield result
-            future.release()
-            for k in itertools.islice(left, 1):
-                coming.add(submit(k))
+        flying = {submit(k): k for k in itertools.islice(left, room)}
+        coming = distributed.as_completed(list(flying))
+        lost = 0
+        for future in coming:
+            k = flying.pop(future)
+            if future.status in ("cancelled", "lost") and lost < _RETRIES * len(chunks):
+                lost += 1
+                sent = send() if sent.status != "finished" else sent
+                following = [k]
+            else:
+                yield future.result()
+                following = list(itertools.islice(left, 1))
+            for k in following:
+                flying[again := submit(k)] = k
+                coming.add(again)
 
 
 def _client(distributed: Any, scheduler: str) -> Any:

@@ -48,7 +48,7 @@ def _seen(loop: Mission, flight: Flight, by_velocity: bool) -> tuple[np.ndarray,
         dx = x - nominal[None]
         return x[:, :, 3], np.stack([dx[:, :, 1], 0 * dx[:, :, 1], dx[:, :, 2]], axis=2)
     dx = np.asarray(deviations(loop, flight)[1])[:, :, 1:]
-    off = np.concatenate([dx, x[:, -1:, 1:] - TARGET], axis=1)
+    off = np.concatenate([dx, x[:, -1:, 1:] - TARGET[None, None]], axis=1)
     over = np.concatenate([np.zeros((len(t), 1), bool), np.diff(t, axis=1) <= 0], axis=1)
     return t, np.where(over[:, :, None], np.nan, off)
 

@@ -87,7 +87,7 @@ def ends(flight: Flight, by_velocity: bool = False) -> Float[np.ndarray, "case 4
     """Final time, and deviations of y, u and v from the target."""
     final = np.asarray(flight.final_state)
     if not by_velocity:
-        return np.column_stack([flight.final_time, final[:, 1:] - TARGET])
+        return np.column_stack([flight.final_time, final[:, 1:] - TARGET[None]])
     y, v, t = final[:, 1] - TARGET[0], final[:, 2], final[:, 3]
     return np.column_stack([t, y, np.asarray(flight.final_time) - TARGET[1], v])
 

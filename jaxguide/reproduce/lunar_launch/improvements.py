@@ -49,7 +49,7 @@ def place_nodes(nominal: Extremal, times: Float[np.ndarray, " case"]) -> Placed:
         again = solve(LunarLaunch(), method(logits), nominal, throw=False)
         loop = thesis_mission(again, max_samples=SAMPLES)
         flown = fly_cases(loop, "ends")
-        return flown.final_time, flown.final_state[:, 1:] - TARGET
+        return flown.final_time, flown.final_state[:, 1:] - TARGET[None]
 
     def loss(logits: Array) -> Array:
         final_time, off = flights(logits)
