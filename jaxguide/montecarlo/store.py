@@ -7,7 +7,7 @@ only if its digest is there and right. Zarr replaces whole files, so none is eve
 
 import hashlib
 import json
-import shutil
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,7 @@ class Store:
     def _make(self, zarr: Any, manifest: Any, variables: Any, coordinates: Any) -> None:
         """Everything beside the final path first, then moved there at once."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        beside = self.path.with_name(self.path.name + ".new")
-        shutil.rmtree(beside, ignore_errors=True)
+        beside = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex}")
         root = zarr.open_group(beside, mode="w", zarr_format=3)
         for name, (dims, shape, dtype) in variables.items():
             root.create_array(

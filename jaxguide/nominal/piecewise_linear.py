@@ -14,10 +14,10 @@ from jaxguide.nominal.conditions import endpoint_lagrangian
 from jaxguide.nominal.dopri8 import dopri8
 from jaxguide.nominal.equality import (
     KKTPoint,
-    conditions,
     derivatives,
     minimise,
     polished,
+    residual,
 )
 from jaxguide.problem import (
     Problem,
@@ -153,7 +153,7 @@ class PiecewiseLinear(eqx.Module):
         z, units = jax.tree_util.tree_map(lambda v: v[best], (zs, units))
         values, args = self._values(units), (problem, self.positions)
         z = polished(values, z, args)
-        error = jnp.max(jnp.abs(jnp.concatenate(conditions(values, z, args))))
+        error = residual(values, z, args)
         extremal = flown(
             problem,
             self.positions,
