@@ -1,0 +1,103 @@
+"""The command line. Heavy imports wait inside the commands, so that `--help` is quick.
+
+Each command returns an `Outcome`; `main` alone prints, reports errors and sets the exit code:
+0 done, 1 failed or out of tolerance, 2 wrong usage.
+"""
+
+import contextlib
+import gc
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from cyclopts import CycloptsError
+from rich.console import Console
+
+from jaxguide.cli import checking, solving, sweeping
+from jaxguide.cli.app import Common, app
+
+COMMANDS = (
+    *(solving.problems, solving.reproduce, solving.solve, solving.gains, solving.fly),
+    *(sweeping.sweep, sweeping.rerun),
+    checking.doctor,
+)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point."""
+    code = run(sys.argv[1:] if argv is None else argv)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # taking XLA's programs down one by one would take a second
+
+
+def run(argv: list[str]) -> int:
+    """Runs one command line and returns its exit code."""
+    try:
+        command, bound, _ = app.parse_args(argv, exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        return _fail(error, 2)
+    common = bound.arguments.get("common", Common())
+    if command not in COMMANDS:  # --help, --version
+        command(*bound.args, **bound.kwargs)
+        return 0
+    configure()
+    stdout = sys.stdout
+    try:
+        # With --json nothing else may reach stdout, not even a library's print.
+        with contextlib.redirect_stdout(sys.stderr if common.json else stdout):
+            outcome = command(*bound.args, **bound.kwargs)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    # The library's own complaints (UnknownName is a ValueError, Equinox's and XLA's errors are
+    # RuntimeErrors), unwritable folders, missing extras. Anything else is a bug: its traceback
+    # is wanted.
+    except (ValueError, RuntimeError, OSError, ImportError) as error:
+        if common.debug:
+            raise
+        if common.json:
+            _print_json({"error": str(error)})
+        return _fail(error, 1)
+    if common.json:
+        _print_json(outcome.data)
+    else:
+        console = Console()
+        if not console.is_terminal:
+            console.width = max(console.width, 120)  # a file need not be 80 columns wide
+        console.print(*outcome.shown, sep="\n")
+    return 0 if outcome.ok else 1
+
+
+def configure() -> None:
+    """float64, and a compilation cache that lasts, for this process.
+
+    Called before JAX and Equinox are imported: both read the environment as they are.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # cache hits on CPU are noisy
+    # Source lines in compiled programs serve debuggers and take a tenth of a short run.
+    os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+    gc.set_threshold(200_000, 20, 20)  # tracing makes objects by the million, few of them garbage
+    # A computation that holds an `eqx.error_if` is a host callback, which is never cached. The
+    # library reports failures as values, so none is needed.
+    os.environ.setdefault("EQX_ON_ERROR", "nan")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # else idle pools spin beside XLA
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxguide"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def _print_json(data: dict[str, Any]) -> None:
+    from jaxguide.reproduce.report import jsonable
+
+    print(json.dumps(jsonable(data), allow_nan=False))
+
+
+def _fail(error: object, code: int) -> int:
+    print(f"jaxguide: {str(error).strip() or type(error).__name__}", file=sys.stderr)
+    return code

@@ -1,0 +1,25 @@
+"""`jaxguide doctor`."""
+
+from rich.table import Table
+from rich.text import Text
+
+from jaxguide.cli.app import Common, Outcome, app
+
+
+@app.command
+def doctor(*, common: Common = Common()) -> Outcome:
+    """Check versions, devices, precision, the compilation cache, and a known fault of JAX.
+
+    Exits with 1 if a check fails.
+    """
+    from jaxguide.doctor import report
+
+    checks = report()
+    ok = all(check["ok"] for check in checks.values())
+    table = Table("", "", "", box=None, show_header=False)
+    for name, check in checks.items():
+        value = check["value"]
+        value = ", ".join(value) if isinstance(value, list) else str(value)
+        verdict = Text("ok", "green") if check["ok"] else Text(check["remedy"], "bold red")
+        table.add_row(name, Text(value), verdict)
+    return Outcome({"ok": ok, "checks": checks}, [table], ok)

@@ -1,0 +1,44 @@
+"""An order of flights at every worker of a Dask cluster. Host only; needs Dask to be imported."""
+
+import contextlib
+import functools
+import uuid
+from collections.abc import Iterator
+
+import jax
+from dask.distributed import Client, WorkerPlugin, get_worker
+
+from jaxguide.montecarlo.cores import over_cores
+from jaxguide.montecarlo.tiles import Order, Tiles
+
+
+class Station(WorkerPlugin):
+    """Holds `order` in a worker. A plugin, not scattered data, which dies with those who hold it:
+    the scheduler hands a plugin to workers that join later or start again, too."""
+
+    def __init__(self, order: Order, x64: bool):
+        self.order, self.x64 = order, x64
+
+    @functools.cached_property
+    def tiles(self) -> Tiles:
+        jax.config.update("jax_enable_x64", self.x64)
+        return Tiles(self.order)
+
+
+@contextlib.contextmanager
+def stationed(client: Client, order: Order) -> Iterator[str]:
+    """The name under which `fly` finds `order` at every worker."""
+    name = f"jaxguide-{uuid.uuid4().hex}"
+    client.register_plugin(Station(order, bool(jax.config.jax_enable_x64)), name=name)  # pyright: ignore
+    try:
+        yield name
+    finally:
+        client.unregister_worker_plugin(name)
+
+
+def fly(name: str, tiles: range, each: int, k: int) -> tuple[int, dict, dict]:
+    """In a worker: number, rows and sums of the chunk `k` of `tiles`."""
+    ready = get_worker().plugins[name].tiles
+    flown = over_cores(ready.fly, tiles, len(ready.devices))
+    rows, sums = ready.chunk(list(flown), each)
+    return k, rows, sums
