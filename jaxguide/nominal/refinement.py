@@ -5,6 +5,7 @@ stop. Host only.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.nominal.pseudospectral import Pseudospectral
-from jaxguide.nominal.structure import Arcs, arcs, without_collapsed
+from jaxguide.nominal.structure import Arcs, arcs, corrected, without_collapsed
 from jaxguide.nominal.transcription import Arcwise
 from jaxguide.nominal.wrappers import Endless
 from jaxguide.problem import Problem, hamiltonian
@@ -38,6 +39,8 @@ _SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
 # Complementarity of a structure, relative to H: up to which it is right, and beyond which wrong.
 # Between, an arc is missing or one too many: better than a mesh, but a finer one may tell.
 _RIGHT, _WRONG, _ATTEMPTS = 1e-5, 1e-2, 3
+_SOUND, _CORRECTIONS = 1e-7, 2  # below it no multiplier asks for another structure
+_BEYOND = 1e-6  # how far bounds may be overstepped between nodes
 _EXACT = 1e-11  # tolerance of its conditions
 _KNOTTED_NODES, _SEGMENTS_A_HORIZON = 12, 8  # of the mesh with free knots
 
@@ -187,9 +190,11 @@ def structured(
     extremal: Extremal,
     found: Arcs,
     watch: Callable[[Progress], None],
+    corrections: int = _CORRECTIONS,
 ) -> tuple[Extremal, float]:
     """The extremal of the structure `found`, and how wrong that is: its complementarity; infinite
-    where it is not clear, not resolved or not feasible."""
+    where it is not clear, not resolved or not feasible. Where multipliers tell what is wrong with
+    it, it is corrected by them."""
     n, m, junctions = problem.n, problem.m, found.junctions
     switches = np.any(np.diff(found.active[:, :m], axis=0), axis=1)
     if not 0 < len(junctions) <= _MOST_JUNCTIONS or not switches.any():
@@ -230,15 +235,25 @@ def structured(
         exact = run(knotted, problem, exact)
     error = float(jnp.max(segment_errors(exact)))
     watch(Progress("free knots", exact, error))
-    kept = without_collapsed(found, np.asarray(exact.breaks)[np.array(edges)])
-    if exact.result == RESULTS.successful and 0 < len(kept.junctions) < len(junctions):
-        return structured(run, original, problem, exact, kept, watch)
+    ends = np.asarray(exact.breaks)[np.array(edges)]
+    again = functools.partial(structured, run, original, problem, exact, watch=watch)
+    if exact.result == RESULTS.successful:
+        kept = without_collapsed(found, ends)
+        if 0 < len(kept.junctions) < len(junctions):
+            return again(kept, corrections=corrections)
     if exact.result != RESULTS.successful or error > method.mesh_tolerance:
         return exact, np.inf
     # A wrong structure shows in multipliers of the wrong sign, or bounds left between nodes.
     value = {row["check"]: row["value"] for row in exact.certificate.rows()}
     left = max(value["control bounds"], value["state bounds"], value.get("path constraints", 0.0))
-    return exact, value["complementarity"] if left <= 1e-6 else np.inf
+    wrong = value["complementarity"] if left <= _BEYOND else np.inf
+    if corrections and _SOUND < wrong:
+        better = corrected(exact, found, ends)
+        if len(better.junctions) > len(junctions):
+            other, less = again(better, corrections=corrections - 1)
+            if less < wrong:
+                return other, less
+    return exact, wrong
 
 
 @eqx.filter_jit

@@ -1,5 +1,7 @@
 """The arcs of an extremal: where bounds and constraints become active or let go. Host only."""
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +17,10 @@ from jaxguide.trajectory import Extremal
 _NEAR, _NEAR_CONTROL = 1e-4, 1e-2
 # What an arc holds at least, else it is the blur of a junction: nodes, and a share of the horizon.
 _LEAST, _SHARE = 2, 2e-3
+# Shorter arcs, of the horizon, are what free knots closed: they stop at 1e-6.
+_CLOSED = 1e-5
+# Multipliers of the wrong sign below this, of their control's largest, are a junction's own error.
+_ROUNDING = 1e-7
 
 
 class Arcs(NamedTuple):
@@ -51,13 +57,38 @@ def arcs(extremal: Extremal) -> Arcs:
 
 def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
     """`found` with its arcs at `edges` (ends included), but for those that free knots closed."""
-    long = np.diff(edges) >= _SHARE * (edges[-1] - edges[0])
+    long = np.diff(edges) >= _CLOSED * (edges[-1] - edges[0])
     keep = np.flatnonzero(long)
     # Alike once what stood between them is gone: one arc.
     same = [np.array_equal(found.active[a], found.active[b]) for a, b in zip(keep, keep[1:])]
     first = keep[np.append(True, ~np.array(same, bool))]
     middle = [(edges[a] + edges[b + 1]) / 2 for a, b in zip(first[1:], _before(keep, first))]
     return Arcs(np.array(middle), found.active[first])
+
+
+def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
+    """`found`, its arcs at `edges` (ends included), with controls that are held at one bound where
+    their multiplier names the other held there instead. Two controls that one junction switches
+    together, for lack of an arc between, come apart: each at its own multiplier's zero."""
+    m = extremal.problem.m
+    t, multiplier = (_own(extremal, a) for a in (extremal.t, extremal.multipliers.control))
+    arc = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(found.active) - 1)
+    # A junction's node belongs to the arcs on both its sides: it says nothing.
+    inside = np.min(np.abs(t[:, None] - edges[None]), axis=1) > 1e-9 * np.ptp(edges)
+    t, multiplier, labels = t[inside], multiplier[inside], found.active[arc[inside]].copy()
+    clear = np.abs(multiplier) > _ROUNDING * np.max(np.abs(multiplier), axis=0)
+    held = labels[:, :m]
+    labels[:, :m] = np.where((held != 0) & clear, np.sign(multiplier), held)
+    return _runs(t, labels, least=lambda a, b: True)
+
+
+def _own(extremal: Extremal, values: Any) -> np.ndarray:
+    """`values` (node, ...) at the nodes of the quadrature alone, segment after segment."""
+    values = np.asarray(values)
+    flat = values.reshape(values.shape[0], -1)
+    own = np.abs(np.asarray(legendre_matrix(extremal.reference_nodes))[0]) > 1e-9
+    by_segment = np.asarray(extremal.by_segment(flat))[:, own]
+    return by_segment.reshape(-1, *values.shape[1:])
 
 
 def _before(keep: np.ndarray, first: np.ndarray) -> list[int]:
@@ -77,9 +108,14 @@ def _by_segment(extremal: Extremal):
 def _cut(t: np.ndarray, labels: np.ndarray) -> Arcs:
     """Runs of equal labels; short ones are shared out between their neighbours."""
     labels = np.stack([_calmed(t, column) for column in labels.T], axis=1)
+    return _runs(t, labels, functools.partial(_lasts, t))
+
+
+def _runs(t: np.ndarray, labels: np.ndarray, least: Callable[[Any, Any], Any]) -> Arcs:
+    """Runs of equal labels that are `least` long; others are shared out between their neighbours."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.any(np.diff(labels, axis=0), axis=1))])
     ends = np.append(starts[1:], len(t))
-    long = [(a, b) for a, b in zip(starts, ends, strict=True) if _lasts(t, a, b)]
+    long = [(a, b) for a, b in zip(starts, ends, strict=True) if least(a, b)]
     merged: list[tuple[int, int]] = []
     for a, b in long:
         if merged and np.array_equal(labels[merged[-1][0]], labels[a]):
