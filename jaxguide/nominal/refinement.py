@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.nominal.pseudospectral import Pseudospectral
-from jaxguide.nominal.structure import Arcs, arcs, corrected, without_collapsed
+from jaxguide.nominal.structure import Arcs, arcs, corrected, laid_out, without_collapsed
 from jaxguide.nominal.transcription import Arcwise
 from jaxguide.nominal.wrappers import Endless
-from jaxguide.problem import Problem, hamiltonian
+from jaxguide.problem import Problem
 from jaxguide.spectral import (
     differentiation_matrix,
     interpolation_matrix,
@@ -35,14 +35,13 @@ _POWER, _FLOOR = 1 / 3, 0.03
 _MOST_NODES, _MOST_SEGMENTS = 14, 96
 _MOST_MOVES = 6  # of the breaks of one size of mesh
 _MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise
-_SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
 # Complementarity of a structure, relative to H: up to which it is right, and beyond which wrong.
 # Between, an arc is missing or one too many: better than a mesh, but a finer one may tell.
 _RIGHT, _WRONG, _ATTEMPTS = 1e-5, 1e-2, 3
-_SOUND, _CORRECTIONS = 1e-7, 2  # below it no multiplier asks for another structure
+_SOUND, _CORRECTIONS = 1e-7, 4  # below it no multiplier asks for another structure
 _BEYOND = 1e-6  # how far bounds may be overstepped between nodes
 _EXACT = 1e-11  # tolerance of its conditions
-_KNOTTED_NODES, _SEGMENTS_A_HORIZON = 12, 8  # of the mesh with free knots
+_KNOTTED_NODES = 12  # of a segment of the mesh with free knots
 
 
 class Progress(NamedTuple):
@@ -195,74 +194,39 @@ def structured(
     """The extremal of the structure `found`, and how wrong that is: its complementarity; infinite
     where it is not clear, not resolved or not feasible. Where multipliers tell what is wrong with
     it, it is corrected by them."""
-    n, m, junctions = problem.n, problem.m, found.junctions
-    switches = np.any(np.diff(found.active[:, :m], axis=0), axis=1)
-    if not 0 < len(junctions) <= _MOST_JUNCTIONS or not switches.any():
+    junctions, switches = found.junctions, found.switches(problem.m)
+    clear = 0 < len(junctions) <= _MOST_JUNCTIONS and switches.any()
+    if not clear or isinstance(problem, Endless):
         return extremal, np.inf
-    if isinstance(problem, Endless):
-        return extremal, np.inf
-    affine = _affine(extremal)
-    t0, tf = float(extremal.t[0]), float(extremal.t[-1])
-    main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
-    breaks, knots, edges = [0.0], [], [0]
-    held, smooth, released, unpathed = [], [], [], []
-    for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
-        # A singular arc gets one polynomial: more would let its control chatter.
-        singular = affine & (found.active[arc, :m] == 0)
-        count = 1 if singular.any() else max(2, int(np.ceil(_SEGMENTS_A_HORIZON * (b - a))))
-        breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
-        held += [found.active[arc, :m].astype(float)] * count
-        smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
-        # With every control held a state bound is implied but for one point, the arc's last.
-        settled = np.all(found.active[arc, :m] != 0)
-        implied = (found.active[arc, m : m + n] != 0) & settled
-        unpathed += [(found.active[arc, m + n :] != 0) & settled] * count
-        if released:
-            released[-1] = released[-1] | np.stack([np.zeros(n, bool), implied])
-        released += [np.stack([implied, implied])] * count
-        released[-1] = np.stack([implied, np.zeros(n, bool)])
-        edges.append(len(breaks) - 1)
-        if arc < len(switches) and switches[arc]:
-            knots.append(len(breaks) - 1)
-    breaks[-1] = 1.0
-    known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released, unpathed)))
+    breaks, knots, edges, known = laid_out(extremal, found)
     original, asked = method, method.tolerance
     method = dataclasses.replace(method, tolerance=min(asked, _EXACT))
-    knotted = _meshed(method, np.array(breaks), _KNOTTED_NODES, tuple(knots), known)
+    knotted = _meshed(method, breaks, _KNOTTED_NODES, knots, known)
     exact = run(knotted, problem, extremal)
     if exact.result != RESULTS.successful:
         knotted = dataclasses.replace(knotted, tolerance=asked)
         exact = run(knotted, problem, exact)
     error = float(jnp.max(segment_errors(exact)))
-    watch(Progress("free knots", exact, error))
-    ends = np.asarray(exact.breaks)[np.array(edges)]
+    ends = np.asarray(exact.breaks)[edges]
     again = functools.partial(structured, run, original, problem, exact, watch=watch)
-    if exact.result == RESULTS.successful:
+    sound = exact.result == RESULTS.successful
+    if sound:
         kept = without_collapsed(found, ends)
         if 0 < len(kept.junctions) < len(junctions):
+            watch(Progress("free knots closed arcs", exact, error))
             return again(kept, corrections=corrections)
-    if exact.result != RESULTS.successful or error > method.mesh_tolerance:
-        return exact, np.inf
-    # A wrong structure shows in multipliers of the wrong sign, or bounds left between nodes.
-    value = {row["check"]: row["value"] for row in exact.certificate.rows()}
-    left = max(value["control bounds"], value["state bounds"], value.get("path constraints", 0.0))
-    wrong = value["complementarity"] if left <= _BEYOND else np.inf
-    if corrections and _SOUND < wrong:
+    wrong = np.inf
+    if sound and error <= method.mesh_tolerance:
+        # A wrong structure shows in multipliers of the wrong sign, or bounds left between nodes.
+        value = {row["check"]: row["value"] for row in exact.certificate.rows()}
+        left = [value[f"{name} bounds"] for name in ("control", "state")]
+        if max(*left, value.get("path constraints", 0.0)) <= _BEYOND:
+            wrong = value["complementarity"]
+    watch(Progress(f"free knots, complementarity {wrong:.0e}", exact, error))
+    if corrections and _SOUND < wrong < np.inf:
         better = corrected(exact, found, ends)
         if len(better.junctions) > len(junctions):
             other, less = again(better, corrections=corrections - 1)
             if less < wrong:
                 return other, less
     return exact, wrong
-
-
-@eqx.filter_jit
-def _curvature(extremal: Extremal) -> Float[Array, "node m"]:
-    along = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))
-    at = (extremal.problem, extremal.t, extremal.x, extremal.u, extremal.costate)
-    return jnp.max(jnp.abs(along(*at)), axis=2)
-
-
-def _affine(extremal: Extremal) -> np.ndarray:
-    """Which controls H is linear in."""
-    return np.asarray(jnp.max(_curvature(extremal), axis=0)) <= 1e-12

@@ -87,10 +87,11 @@ def straight_guess(
             return problem.endpoint_constraints(moved[:n], moved[n:], t0, tf)
 
         e, J = at(jnp.zeros_like(ends)), jax.jacfwd(at)(jnp.zeros_like(ends))
-        miss = e - jnp.clip(e, e_lo, e_hi)
-        gram = J @ J.T
-        ridge = 1e-8 * (jnp.trace(gram) + 1e-30) * jnp.eye(q, dtype=dtype)
-        step = J.T @ small_solve(gram + ridge, miss)
+        # By rows of one size, lest the ridge drown those of small units.
+        size = jnp.linalg.norm(J, axis=1)
+        size = jnp.where(size > 0, size, 1.0)
+        miss, J = (e - jnp.clip(e, e_lo, e_hi)) / size, J / size[:, None]
+        step = J.T @ small_solve(J @ J.T + 1e-8 * jnp.eye(q, dtype=dtype), miss)
         step = jnp.where(jnp.isfinite(step), step, 0.0)
         return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
 
@@ -243,12 +244,15 @@ def duals(
     return {"y": Rows(defect, path, end), "net": net}
 
 
-def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
-    """The larger finite bound; else the largest value seen; else 1."""
+def typical(
+    lo: Array, hi: Array, seen: Float[Array, "k n"], travel: Array | float = 0.0
+) -> Float[Array, " n"]:
+    """The larger finite bound; else the largest value seen; else the way travelled; else 1."""
     bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
     wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
     scale = jnp.where(bounded & (wide > 0), wide, jnp.max(jnp.abs(seen), axis=0))
-    return jnp.where(scale > 1e-8, scale, 1.0)
+    scale = jnp.where(scale > 1e-8, scale, travel)
+    return jnp.where((scale > 1e-8) & jnp.isfinite(scale), scale, 1.0)
 
 
 def designer_units(program: Transcription, w: Primal) -> Scale:
@@ -256,7 +260,10 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     problem, size, dtype = program.problem, program.sizes, program.dtype
     x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
     u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
-    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
+    # What rests at zero along the guess, such as a free final position, is measured by its rate.
+    rate, _ = program.values(w)
+    travel = 2 * jnp.sum(jnp.max(jnp.abs(rate[:, :, : size.n]), axis=1), axis=0)
+    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]), travel)
     u = typical(u_lo, u_hi, jnp.zeros((1, size.m), dtype))
     t = jnp.maximum(w.times[1] - w.times[0], 1e-8)
     p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)

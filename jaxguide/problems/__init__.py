@@ -45,6 +45,7 @@ _LIBRARY = {
     "shuttle-reentry-heat": ("shuttle", "ShuttleReentryHeat"),
     "npsat1": ("npsat1", "NPSAT1"),
     "lunar-launch": ("lunar_launch", "LunarLaunch"),
+    "delta-iii": ("delta_iii", "DeltaIII"),
 }
 
 
