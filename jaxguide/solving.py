@@ -1,5 +1,6 @@
 """`jg.solve`: from a Problem to a certified Extremal."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +19,8 @@ from jaxguide.nominal.wrappers import closed, endless, opened
 from jaxguide.problem import Problem, is_free, validate, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
+
+_COARSE = 3  # segments of the mesh that is tried where the first one fails
 
 
 def solve(
@@ -162,7 +165,17 @@ def _best(method: Pseudospectral, problem: Problem, guess: Any) -> Extremal:
         good, better = (bool(e.result == RESULTS.successful) for e in (best, other))
         if better and not (good and float(best.objective) <= float(other.objective)):
             best = other
+    coarse = dataclasses.replace(method, segments=_COARSE)
+    if best.result != RESULTS.successful and guess is None and _has_ladder(method):
+        # The ladder of grids from below (review, section 4.4): fewer nodes ask less of a guess.
+        below = _run(coarse, problem, None)
+        if below.result == RESULTS.successful:
+            return _run(method, problem, below)
     return best
+
+
+def _has_ladder(method: Pseudospectral) -> bool:
+    return bool(method.refinements) and method.fractions is None and method.segments > _COARSE
 
 
 def _run(method: Any, problem: Problem, guess: Any) -> Extremal:

@@ -13,9 +13,7 @@ import jaxguide as jg
 from jaxguide import problems
 from jaxguide.nominal import kkt
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
-from jaxguide.nominal.refinement import moved
 from jaxguide.nominal.starting import edges
-from jaxguide.nominal.structure import Arcs, _cut, without_collapsed
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
 from jaxguide.problems import EarthMars
 
@@ -272,30 +270,6 @@ def test_bad_options(options, words):
         jg.Pseudospectral(**options)
 
 
-def test_moved_mesh_goes_where_the_error_is():
-    fractions, errors = np.linspace(0, 1, 11), np.full(10, 1e-9)
-    errors[3] = 1e-2
-    new = moved(fractions, errors, 10)
-    assert new[0] == 0 and new[-1] == 1 and np.all(np.diff(new) > 0)
-    inside = np.sum((new > 0.3) & (new < 0.4))
-    assert inside >= 6
-
-
-# What a fixed mesh of 12 segments of 6 Radau nodes leaves of the objective, from a straight line as
-# guess, of one problem of each kind: each is a program of its own, and compiles for seconds.
-KINDS = {
-    "rayleigh": 1e-6, "isoperimetric": 1e-8, "jackson": 1e-5, "goddard": 1e-4, "robot-arm": 1e-4,
-    "shuttle-reentry-heat": 1e-3,
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "left"), KINDS.items())
-def test_library_from_a_straight_line(name, left):
-    e = jg.solve(problems.get(name), jg.Pseudospectral(refinements=0))
-    np.testing.assert_allclose(e.objective, problems.reference(name).value, rtol=left)
-
-
 class Endless(jg.Problem):
     """x' = x + u, cost x^2 + u^2, for ever: J = 1 + sqrt 2, u = -(1 + sqrt 2) x."""
 
@@ -324,140 +298,12 @@ def test_infinite_horizon():
     np.testing.assert_allclose(at.u, -(1 + np.sqrt(2)) * at.x, atol=1e-5)
 
 
-def test_phases():
-    """The moon lander as a fall and a burn, linked; each phase has its own extremal and clock."""
-
-    class Fall(problems.MoonLander):
-        control_bounds = (0.0, 0.0)
-        final_time = jg.Free(0.1, 3.0, 1.0)
-
-        def endpoint_constraints(self, x0, xf, t0, tf):
-            return jnp.zeros(0)
-
-    class Burn(problems.MoonLander):
-        initial_state = None
-        control_bounds = (3.0, 3.0)
-        final_time = jg.Free(1.0, 10.0, 3.0)
-
-    phased = jg.Phased((Fall(), Burn()))
-    e = jg.solve(phased, jg.Pseudospectral(nodes=4, segments=1, refinements=0))
-    np.testing.assert_allclose(e.objective, problems.reference("moon-lander").value, rtol=1e-9)
-    fall, burn = phased.split(e)
-    # Coast for (sqrt 68 - 4)/3, then the burn lasts 4/3 longer.
-    switch = (np.sqrt(68) - 4) / 3
-    np.testing.assert_allclose(fall.final_time, switch, rtol=1e-8)
-    np.testing.assert_allclose(burn.final_time, 2 * switch + 4 / 3, rtol=1e-8)
-    np.testing.assert_allclose(burn.x[0], fall.x[-1], atol=1e-9)
-    np.testing.assert_allclose(burn.costate[0], fall.costate[-1], atol=1e-7)
-    assert bool(burn.certificate.passed.all()), str(burn.certificate)
-
-
-@pytest.mark.slow
-def test_goddard_in_three_phases():
-    """Boost, singular arc, coast: with the singular control kept smooth, the optimum to what is
-    known of it; where it is not, the control oscillates and overshoots it by 2e-5."""
-
-    class Boost(problems.Goddard):
-        control_bounds = (1.0, 1.0)
-        final_time = jg.Free(0.005, 0.1, 0.02)
-
-        def endpoint_cost(self, x0, xf, t0, tf):
-            return 0.0
-
-        def endpoint_constraints(self, x0, xf, t0, tf):
-            return jnp.zeros(0)
-
-    class Singular(Boost):
-        control_bounds = (0.0, 1.0)
-        initial_state = None
-        initial_time = jg.Free(0.005, 0.1, 0.02)
-        final_time = jg.Free(0.03, 0.2, 0.07)
-
-    class Coast(problems.Goddard):
-        control_bounds = (0.0, 0.0)
-        initial_state = None
-        initial_time = jg.Free(0.03, 0.2, 0.07)
-        final_time = jg.Free(0.1, 0.4, 0.2)
-        state_bounds = ((1.0, -1.0, 0.5), (2.0, 2.0, 1.0))  # the mass stays at its end value, 0.6
-
-    method = jg.Pseudospectral(nodes=12, segments=1, refinements=0, smoothing=(0.0, 100.0, 0.0))
-    e = jg.solve(jg.Phased((Boost(), Singular(), Coast())), method)
-    known = problems.reference("goddard")
-    np.testing.assert_allclose(e.objective, known.value, atol=known.uncertainty)
-
-
-def test_phases_that_do_not_join_are_refused():
-    with pytest.raises(ValueError, match="say in `links` how they join"):
-        jg.Phased((DoubleIntegrator(), EarthMars()))
-    with pytest.raises(ValueError, match="give at least two"):
-        jg.Phased((DoubleIntegrator(),))
-
-
-def test_a_jump_of_the_state_by_links():
-    # Half the way is given: from x = 0 to 1/4, then from 3/4 to 1.
-    class First(DoubleIntegrator):
-        final_time = 0.5
-
-        def endpoint_constraints(self, x0, xf, t0, tf):
-            return xf - jnp.array([0.25, 1.0])
-
-    class Second(DoubleIntegrator):
-        initial_state = None
-        final_time = 1.0
-
-    def jump(ends):
-        return ends[1].x0 - ends[0].xf - jnp.array([0.5, 0.0])
-
-    e = jg.solve(
-        jg.Phased((First(), Second()), jump), jg.Pseudospectral(nodes=4, segments=1, refinements=0)
-    )
-    # Both halves fly at u = +-2: x = t^2, and backwards; J = int u^2/2 dt = 2.
-    np.testing.assert_allclose(e.objective, 2.0, rtol=1e-9)
-
-
 def test_relaxed_dynamics_cost_less():
     method = jg.Pseudospectral(nodes=5, segments=2, refinements=0, relaxation=1e-2)
     e = jg.solve(DoubleIntegrator(), method)
     # J(delta) = 6 - delta (int |lambda_x| + int |lambda_v|) to first order = 6 - 15 delta.
     np.testing.assert_allclose(e.objective, 6 - 15e-2, atol=15e-2 * 0.05)
     assert e.u.shape[1] == 1
-
-
-def test_structure_is_found_and_solved_exactly():
-    steps = []
-    e = jg.solve(problems.get("moon-lander"), jg.Pseudospectral(), watch=steps.append)
-    assert [s.step for s in steps][-1] == "free knots", list(map(str, steps))
-    # Its conditions are met to 1e-11.
-    np.testing.assert_allclose(e.objective, problems.reference("moon-lander").value, rtol=1e-11)
-    assert bool(e.certificate.passed.all()), str(e.certificate)
-
-
-def test_arcs_of_labels():
-    t = np.linspace(0, 1, 40)
-    labels = np.where(t < 0.3, -1, 1)[:, None]
-    labels[20] = 0  # the blur of a node
-    found = _cut(t, labels)
-    assert found.active.ravel().tolist() == [-1, 1]
-    np.testing.assert_allclose(found.junctions, 0.3, atol=1 / 39)
-
-
-def test_arcs_that_free_knots_closed_are_dropped():
-    found = Arcs(np.array([0.5, 0.6, 0.8]), np.array([[-1], [0], [1], [0]]))
-    kept = without_collapsed(found, np.array([0.0, 0.55, 0.550001, 0.8, 1.0]))
-    assert kept.active.ravel().tolist() == [-1, 1, 0]
-    np.testing.assert_allclose(kept.junctions, [0.5500005, 0.8])
-    alike = Arcs(found.junctions[:2], np.array([[-1], [0], [-1]]))
-    assert len(without_collapsed(alike, np.array([0.0, 0.55, 0.550001, 1.0])).junctions) == 0
-
-
-def test_random_starts_are_extremals_or_reasons():
-    method = jg.Pseudospectral(nodes=5, segments=4, refinements=0)
-    problem = problems.get("brachistochrone")
-    found = [
-        jg.solve(problem, method, guess=jax.random.key(k), throw=False).objective for k in range(4)
-    ]
-    best = jg.solve(problem, dataclasses.replace(method, starts=4))
-    assert float(best.objective) <= min(map(float, found)) + 1e-9
 
 
 class Undefined(DoubleIntegrator):
@@ -488,13 +334,6 @@ def test_discontinuous_dynamics_fail_the_certificate():
     assert not rows["state equation"]
 
 
-@pytest.mark.slow
-def test_npsat1_on_one_segment():
-    # reference/pseudospectral.md: CasADi + IPOPT, N = 40, from any guess.
-    e = jg.solve(problems.get("npsat1"), jg.Pseudospectral("lgl", 41, 1, refinements=0))
-    np.testing.assert_allclose(e.objective, 112.2088, atol=5e-5)
-
-
 def test_warm_start_with_multipliers(capfd):
     """A solution of one mesh is one of the next, but for a few steps; the log counts them."""
     method = jg.Pseudospectral(nodes=5, segments=4, refinements=0, log=True)
@@ -507,19 +346,3 @@ def test_warm_start_with_multipliers(capfd):
     second = capfd.readouterr().out.splitlines()
     assert first[0].split() == ["iter", "objective", "violation", "error", "mu", "delta", "step"]
     assert len(second) < len(first) / 2
-
-
-def test_bellman_segments_do_not_add_up_errors():
-    problem = problems.get("brachistochrone")
-    method = jg.Pseudospectral("lgl", 7, 1, refinements=0)
-
-    def miss(segments):
-        b = jg.bellman(problem, method, segments)
-        assert bool(b.result == jg.RESULTS.successful)
-        end = problem.endpoint_constraints(b.x[0], b.x[-1], b.t[0], b.t[-1])
-        return float(jnp.max(jnp.abs(end)))
-
-    # What remains is half as long, so its interpolation error a 2^5th of that of the whole, which
-    # is well above that of the solver.
-    whole = miss(1)
-    assert whole > 1e-8 and miss(2) < whole / 8

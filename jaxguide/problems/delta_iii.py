@@ -41,12 +41,8 @@ class Stage(Problem):
     initial_state: Any = Free()
     state_names = ("x", "y", "z", "vx", "vy", "vz", "m")
     control_names = ("ux", "uy", "uz")
-    state_bounds = (  # with room: they tell the units
-        (*(-2 * _RADIUS,) * 3, *(-1.2e4,) * 3, 1e3),
-        (*(2 * _RADIUS,) * 3, *(1.2e4,) * 3, 3.1e5),
-    )
-    control_bounds = (-1.1, 1.1)
-    path_bounds = (-1.0, 1.0)
+    control_bounds = (-3.0, 3.0)  # with room: the path constraint limits it
+    path_bounds = (-jnp.inf, 1.0)
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         r, v, m = x[:3], x[3:6], x[6]
@@ -113,6 +109,12 @@ class DeltaIII(Phased):
         super().__init__(stages() if phases is None else phases, staging, **derived)
 
 
+def _box(heaviest: float) -> tuple:
+    """State bounds, with room: they tell the units."""
+    high = (*(2 * _RADIUS,) * 3, *(1.2e4,) * 3, 1.05 * heaviest)
+    return (*(-v for v in high[:6]), 1e3), high
+
+
 def stages(density: float = 1.225) -> tuple[Stage, ...]:
     """The four phases."""
     rate = lambda part: part[1] / part[3]
@@ -128,14 +130,23 @@ def stages(density: float = 1.225) -> tuple[Stage, ...]:
     unknown, dry = (Free(),) * 6, _PAYLOAD + _SECOND[0]
     second = on_pad - 6 * _BOOSTER[0] - once * rate(_FIRST)
     third = dry + _FIRST[0] - 2 * once * rate(_FIRST)
+    free = lambda mass: (*unknown, Free(guess=mass))
     return (
-        Stage(**burning(6), final_time=once, initial_state=(*start, *with_earth, on_pad)),
-        Stage(**burning(3), final_time=2 * once, initial_state=(*unknown, Free(guess=second))),
-        Stage(**burning(0), final_time=_FIRST[3], initial_state=(*unknown, Free(guess=third))),
+        Stage(
+            **burning(6), final_time=once, initial_state=(*start, *with_earth, on_pad),
+            state_bounds=_box(on_pad),
+        ),
+        Stage(
+            **burning(3), final_time=2 * once, initial_state=free(second),
+            state_bounds=_box(second),
+        ),
+        Stage(
+            **burning(0), final_time=_FIRST[3], initial_state=free(third),
+            state_bounds=_box(third),
+        ),
         Injection(
-            thrust=_SECOND[2], flow=rate(_SECOND), density=density,
-            initial_state=(*unknown, Free(guess=dry)),
-            final_time=Free(_FIRST[3] + 1.0, _FIRST[3] + _SECOND[3], 900.0),
+            thrust=_SECOND[2], flow=rate(_SECOND), density=density, initial_state=free(dry),
+            state_bounds=_box(dry), final_time=Free(_FIRST[3] + 1.0, _FIRST[3] + _SECOND[3], 900.0),
         ),
     )  # fmt: skip
 

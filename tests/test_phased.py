@@ -1,0 +1,111 @@
+"""Phases one after another: linked, with jumps, staged."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import DoubleIntegrator
+
+import jaxguide as jg
+from jaxguide import problems
+from jaxguide.problems import EarthMars
+
+
+def test_phases():
+    """The moon lander as a fall and a burn, linked; each phase has its own extremal and clock."""
+
+    class Fall(problems.MoonLander):
+        control_bounds = (0.0, 0.0)
+        final_time = jg.Free(0.1, 3.0, 1.0)
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return jnp.zeros(0)
+
+    class Burn(problems.MoonLander):
+        initial_state = None
+        control_bounds = (3.0, 3.0)
+        final_time = jg.Free(1.0, 10.0, 3.0)
+
+    phased = jg.Phased((Fall(), Burn()))
+    e = jg.solve(phased, jg.Pseudospectral(nodes=4, segments=1, refinements=0))
+    np.testing.assert_allclose(e.objective, problems.reference("moon-lander").value, rtol=1e-9)
+    fall, burn = phased.split(e)
+    # Coast for (sqrt 68 - 4)/3, then the burn lasts 4/3 longer.
+    switch = (np.sqrt(68) - 4) / 3
+    np.testing.assert_allclose(fall.final_time, switch, rtol=1e-8)
+    np.testing.assert_allclose(burn.final_time, 2 * switch + 4 / 3, rtol=1e-8)
+    np.testing.assert_allclose(burn.x[0], fall.x[-1], atol=1e-9)
+    np.testing.assert_allclose(burn.costate[0], fall.costate[-1], atol=1e-7)
+    assert bool(burn.certificate.passed.all()), str(burn.certificate)
+
+
+@pytest.mark.slow
+def test_goddard_in_three_phases():
+    """Boost, singular arc, coast: with the singular control kept smooth, the optimum to what is
+    known of it; where it is not, the control oscillates and overshoots it by 2e-5."""
+
+    class Boost(problems.Goddard):
+        control_bounds = (1.0, 1.0)
+        final_time = jg.Free(0.005, 0.1, 0.02)
+
+        def endpoint_cost(self, x0, xf, t0, tf):
+            return 0.0
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return jnp.zeros(0)
+
+    class Singular(Boost):
+        control_bounds = (0.0, 1.0)
+        initial_state = None
+        initial_time = jg.Free(0.005, 0.1, 0.02)
+        final_time = jg.Free(0.03, 0.2, 0.07)
+
+    class Coast(problems.Goddard):
+        control_bounds = (0.0, 0.0)
+        initial_state = None
+        initial_time = jg.Free(0.03, 0.2, 0.07)
+        final_time = jg.Free(0.1, 0.4, 0.2)
+        state_bounds = ((1.0, -1.0, 0.5), (2.0, 2.0, 1.0))  # the mass stays at its end value, 0.6
+
+    method = jg.Pseudospectral(nodes=12, segments=1, refinements=0, smoothing=(0.0, 100.0, 0.0))
+    e = jg.solve(jg.Phased((Boost(), Singular(), Coast())), method)
+    known = problems.reference("goddard")
+    np.testing.assert_allclose(e.objective, known.value, atol=known.uncertainty)
+
+
+def test_phases_that_do_not_join_are_refused():
+    with pytest.raises(ValueError, match="say in `links` how they join"):
+        jg.Phased((DoubleIntegrator(), EarthMars()))
+    with pytest.raises(ValueError, match="give at least two"):
+        jg.Phased((DoubleIntegrator(),))
+
+
+def test_a_jump_of_the_state_by_links():
+    # Half the way is given: from x = 0 to 1/4, then from 3/4 to 1.
+    class First(DoubleIntegrator):
+        final_time = 0.5
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return xf - jnp.array([0.25, 1.0])
+
+    class Second(DoubleIntegrator):
+        initial_state = None
+        final_time = 1.0
+
+    def jump(ends):
+        return ends[1].x0 - ends[0].xf - jnp.array([0.5, 0.0])
+
+    e = jg.solve(
+        jg.Phased((First(), Second()), jump), jg.Pseudospectral(nodes=4, segments=1, refinements=0)
+    )
+    # Both halves fly at u = +-2: x = t^2, and backwards; J = int u^2/2 dt = 2.
+    np.testing.assert_allclose(e.objective, 2.0, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_four_stages_to_orbit():
+    """Delta III without a guess: 12 segments of 6 nodes do not find in, 3 segments lead there. The
+    barrier leaves 480 directions short of length one: 1e-10 of 24 t each, 1.5e-7 of the mass."""
+    e = jg.solve(problems.get("delta-iii"), jg.Pseudospectral())
+    known = problems.reference("delta-iii")
+    np.testing.assert_allclose(e.objective, known.value, rtol=2e-7)
+    assert bool(e.certificate.passed.all()), str(e.certificate)
