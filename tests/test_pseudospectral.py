@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
 from jaxguide import problems
-from jaxguide.nominal import kkt
+from jaxguide.nominal import elimination, kkt, newton
 from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
 from jaxguide.nominal.starting import edges
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
@@ -84,12 +84,14 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     def structured():
         nodes, ends = program.derivatives(w)
         _, c = program.objective_and_residual(w)
-        system = kkt.System(nodes, ends, *program.hessians(w, y), sigma, given)
-        parts = kkt.eliminate(program, system)
+        system = newton.System(nodes, ends, *program.hessians(w, y), sigma, given)
+        parts = elimination.eliminate(program, system)
         factor, ok = kkt.factorise(program, system, parts, delta, jnp.asarray(5.0))
-        objective = kkt.gradient(program, nodes, ends, w, jax.tree_util.tree_map(jnp.zeros_like, y))
+        objective = newton.gradient(
+            program, nodes, ends, w, jax.tree_util.tree_map(jnp.zeros_like, y)
+        )
         force = jax.tree_util.tree_map(jnp.add, objective, pull)
-        load = kkt.Load(force, c._replace(path=c.path + kkt.COMPLIANCE * y.path))
+        load = newton.Load(force, c._replace(path=c.path + newton.COMPLIANCE * y.path))
         return kkt.solve(program, system, parts, factor, load), ok
 
     flat, unravel = ravel_pytree(w)
@@ -108,7 +110,7 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     H, A, g, c = (np.asarray(a) for a in dense())
     slack = np.asarray(ravel_pytree(no._replace(path=~no.path, end=~no.end))[0])
     diagonal = np.asarray(ravel_pytree(sigma)[0]) + np.where(slack, 0, delta)
-    soft = y_back(jnp.zeros_like(y_flat))._replace(path=jnp.full(y.path.shape, kkt.COMPLIANCE))
+    soft = y_back(jnp.zeros_like(y_flat))._replace(path=jnp.full(y.path.shape, newton.COMPLIANCE))
     soft = np.asarray(ravel_pytree(soft)[0])
     K = np.block([[H + np.diag(diagonal), A.T], [A, -np.diag(soft)]])
     rhs = -np.concatenate([g + np.asarray(ravel_pytree(pull)[0]), c + soft * np.asarray(y_flat)])

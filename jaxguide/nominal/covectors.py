@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.nominal import interior_point, kkt
+from jaxguide.nominal import interior_point, newton
+from jaxguide.nominal.box import boxed, distances
 from jaxguide.nominal.mesh import left_null
 from jaxguide.nominal.shooting import unwrap_angles
 from jaxguide.nominal.transcription import Bounds, Transcription, bounds, node_times
@@ -37,7 +38,7 @@ def to_extremal(
     t = jnp.concatenate([t_support[:, :-1].reshape(-1), t_support[-1, -1:]])
     lam, before, impulse = costates(program, box, solution)
     nodes, ends = program.derivatives(w)
-    left = kkt.gradient(program, nodes, ends, w, solution.y).u
+    left = newton.gradient(program, nodes, ends, w, solution.y).u
     net_u = jnp.where(box.lo.u >= box.hi.u, -left, solution.zu.u - solution.zl.u)
     to_user = scale.objective / scale.x
     # Controls and multipliers live at the nodes; the ends that are none, extrapolate them.
@@ -109,11 +110,11 @@ def to_extremal(
 def _undecided(program: Transcription, solution: interior_point.Solution) -> Bool[Array, ""]:
     """Whether a bound's distance and multiplier, whose product is the barrier mu, are both small:
     within a factor of 10 of sqrt(mu), where the barrier's derivative is off by a hundredth."""
-    box = interior_point.boxed(bounds(program))
+    box = boxed(bounds(program))
     small = 10 * jnp.sqrt(solution.mu)
     weak = lambda gap, z, on: jnp.any(on & (gap < small) & (z < small))
     sides = zip(
-        interior_point.distances(box, solution.w), (solution.zl, solution.zu),
+        distances(box, solution.w), (solution.zl, solution.zu),
         (box.below, box.above), strict=True,
     )  # fmt: skip
     found = [jax.tree_util.tree_leaves(jax.tree_util.tree_map(weak, *side)) for side in sides]

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from jaxguide.nominal import kkt
-from jaxguide.nominal.interior_point import Solution, barrier_gradient, boxed, distances
+from jaxguide.nominal import elimination, kkt, newton
+from jaxguide.nominal.box import barrier_gradient, boxed, distances
+from jaxguide.nominal.interior_point import Solution
 from jaxguide.nominal.transcription import Primal, Transcription, bounds
 
 _tree = jax.tree_util.tree_map
@@ -26,7 +27,7 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
     w, y, mu = solution.w, solution.y, solution.mu
     given = boxed(bounds(program)).given
 
-    def conditions(problem: Any) -> tuple[kkt.Load, Primal, tuple[Primal, Primal]]:
+    def conditions(problem: Any) -> tuple[newton.Load, Primal, tuple[Primal, Primal]]:
         here = eqx.tree_at(lambda p: p.problem, program, problem)
         box = boxed(bounds(here))
         at = _tree(lambda w, g, lo: jnp.where(g, lo, w), w, given, box.lo)
@@ -34,11 +35,11 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
 
         nodes, ends = here.derivatives(at)
         _, c = here.objective_and_residual(at, (nodes.value, ends.value))
-        force = kkt.gradient(here, nodes, ends, at, y)
+        force = newton.gradient(here, nodes, ends, at, y)
         force = _tree(jnp.add, force, barrier_gradient(box, low, high, mu))
         force = _tree(lambda f, g: jnp.where(g, 0.0, f), force, given)
         fixed = _tree(lambda g, lo: jnp.where(g, lo, 0.0), given, box.lo)
-        return kkt.Load(force, c), fixed, (low, high)
+        return newton.Load(force, c), fixed, (low, high)
 
     out, moved = eqx.filter_jvp(conditions, (program.problem,), (tangent,))
     fill = lambda t, o: jnp.zeros_like(o) if t is None else t
@@ -48,23 +49,23 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
     curve = lambda a, on: jnp.where(on, mu / a**2, 0.0)
     sigma = _tree(lambda a, b, l, h: curve(a, l) + curve(b, h), low, high, box.below, box.above)
     nodes, ends = program.derivatives(w)
-    system = kkt.System(nodes, ends, *program.hessians(w, y), sigma, given)
-    segments = kkt.eliminate(program, system)
+    system = newton.System(nodes, ends, *program.hessians(w, y), sigma, given)
+    segments = elimination.eliminate(program, system)
     zero = jnp.zeros_like(mu)
     largest = jnp.max(jnp.abs(system.node_hessian), initial=0.0)
     factor, _ = kkt.factorise(program, system, segments, zero, 1e2 * (1 + largest))
 
     # One flat vector: transposition wants a right-hand side that is linear as a whole.
-    right = kkt.Step(_tree(jnp.negative, load.force), _tree(jnp.negative, load.residual))
+    right = newton.Step(_tree(jnp.negative, load.force), _tree(jnp.negative, load.residual))
     flat, unravel = ravel_pytree(right)
 
     def product(v: jax.Array) -> jax.Array:
-        load = kkt.product(program, system, zero, unravel(v))
-        return ravel_pytree(kkt.Step(load.force, load.residual))[0]
+        load = newton.product(program, system, zero, unravel(v))
+        return ravel_pytree(newton.Step(load.force, load.residual))[0]
 
     def solve(_: Any, v: jax.Array) -> jax.Array:
         step = unravel(-v)
-        load = kkt.Load(step.primal, step.dual)
+        load = newton.Load(step.primal, step.dual)
         return ravel_pytree(kkt.solve(program, system, segments, factor, load))[0]
 
     step = unravel(jax.lax.custom_linear_solve(product, flat, solve, symmetric=True))

@@ -10,13 +10,26 @@ adaptive barrier: Nocedal, Waechter & Waltz, SIAM J. Optim. 19 (2009), Mehrotra'
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxguide.nominal import kkt
+from jaxguide.nominal import elimination, kkt, newton
+from jaxguide.nominal.box import (
+    Box,
+    Entries,
+    barrier_gradient,
+    barrier_value,
+    boxed,
+    complementarity,
+    distances,
+    inside,
+    longest_dual_step,
+    longest_step,
+    total,
+)
 from jaxguide.nominal.log import report
 from jaxguide.nominal.transcription import (
     Bounds,
@@ -29,14 +42,12 @@ from jaxguide.nominal.transcription import (
 )
 
 _tree = jax.tree_util.tree_map
-Entries: TypeAlias = Any  # one number an unknown: a Primal, or all of them as one vector
 
 # Constants of the paper, section 3.
 _KAPPA_EPS, _KAPPA_MU, _THETA_MU, _TAU_MIN = 10.0, 0.2, 1.5, 0.99
-_KAPPA_SIGMA, _KAPPA_D, _S_MAX = 1e10, 1e-5, 100.0
+_KAPPA_SIGMA, _S_MAX = 1e10, 100.0
 _GAMMA, _DELTA, _S_THETA, _S_PHI, _ETA = 1e-5, 1.0, 1.1, 2.3, 1e-4
 _DELTA_FIRST, _DELTA_MAX = 1e-4, 1e12
-_RELAX = 1e-9  # of every bound, so that a state may end on one and the interior is not empty
 _S_D_MAX = 1e4  # multipliers may not excuse more than this of the gradient
 _HALVINGS, _FILTER = 30, 128
 # The barrier is free below `_NEAR` while the error falls below `_FALL` of its worst in as many such
@@ -110,120 +121,21 @@ class _State(NamedTuple):
     errors: Array  # at the last iterates of the free kind
 
 
-class _Box(NamedTuple):
-    """Bounds with what follows from them."""
-
-    lo: Entries
-    hi: Entries
-    below: Entries  # bool: has a lower bound and may move
-    above: Entries
-    given: Entries
-
-
-def boxed(bounds: Bounds) -> _Box:
-    """Bounds with a little room; entries whose bounds coincide are given, but for states."""
-    lo, hi = bounds
-    room = lambda b: _RELAX * jnp.maximum(1.0, jnp.abs(b))
-    given = _tree(lambda a, b: a >= b, lo, hi)
-    given = given._replace(x=jnp.zeros_like(given.x))
-    lo = _tree(lambda a, g: jnp.where(g, a, a - room(a)), lo, given)
-    hi = _tree(lambda b, g: jnp.where(g, b, b + room(b)), hi, given)
-    below = _tree(lambda a, g: jnp.isfinite(a) & ~g, lo, given)
-    above = _tree(lambda b, g: jnp.isfinite(b) & ~g, hi, given)
-    return _Box(lo, hi, below, above, given)
-
-
-def inside(box: _Box, w: Entries, push: Any) -> Entries:
-    """`w` moved well within its bounds, given entries put where they belong (section 3.6)."""
-
-    def one(w: Array, lo: Array, hi: Array, below: Array, above: Array, given: Array) -> Array:
-        width = jnp.where(below & above, hi - lo, jnp.inf)
-        step = lambda b: jnp.minimum(push * jnp.maximum(1.0, jnp.abs(b)), push * width)
-        w = jnp.where(below, jnp.maximum(w, lo + step(jnp.where(below, lo, 0.0))), w)
-        w = jnp.where(above, jnp.minimum(w, hi - step(jnp.where(above, hi, 0.0))), w)
-        return jnp.where(given, lo, w)
-
-    return _tree(one, w, box.lo, box.hi, box.below, box.above, box.given)
-
-
-def distances(box: _Box, w: Entries) -> tuple[Entries, Entries]:
-    """Distances to the bounds, 1 where there is none."""
-    low = _tree(
-        lambda w, b, on: jnp.where(on, w - jnp.where(on, b, 0.0), 1.0), w, box.lo, box.below
-    )
-    high = _tree(
-        lambda w, b, on: jnp.where(on, jnp.where(on, b, 0.0) - w, 1.0), w, box.hi, box.above
-    )
-    return low, high
-
-
-def _total(tree: Any) -> Array:
-    return sum((jnp.sum(a) for a in jax.tree_util.tree_leaves(tree)), jnp.zeros(()))
-
-
 def _largest(tree: Any) -> Array:
     leaves = [jnp.max(jnp.abs(a), initial=0.0) for a in jax.tree_util.tree_leaves(tree)]
     return jnp.max(jnp.stack(leaves))
 
 
 def _finite(tree: Any) -> Array:
-    return jnp.isfinite(_total(_tree(jnp.abs, tree)))
+    return jnp.isfinite(total(_tree(jnp.abs, tree)))
 
 
 def _norm1(c: Rows) -> Array:
-    return _total(_tree(jnp.abs, c))
+    return total(_tree(jnp.abs, c))
 
 
 def _count(tree: Any) -> int:
     return sum(a.size for a in jax.tree_util.tree_leaves(tree))
-
-
-def complementarity(box: _Box, low: Entries, high: Entries, zl: Entries, zu: Entries) -> Array:
-    """Mean of distance times multiplier over all bounds; 0 where there is none."""
-    both = _tree(lambda a, b, x, y: a * x + b * y, low, high, zl, zu)
-    count = _total(
-        _tree(lambda a, b: jnp.where(a, 1.0, 0.0) + jnp.where(b, 1.0, 0.0), box.below, box.above)
-    )
-    return _total(both) / jnp.maximum(count, 1.0)
-
-
-def _barrier(box: _Box, w: Entries, mu: Array) -> Array:
-    """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
-    low, high = distances(box, w)
-    log = lambda a: jnp.log(jnp.where(a > 0, a, jnp.nan))
-    logs = _total(_tree(lambda a, b: log(a) + log(b), low, high))
-    one = lambda a, b, l, h: _KAPPA_D * (jnp.where(l & ~h, a, 0.0) + jnp.where(h & ~l, b, 0.0))
-    return mu * (_total(_tree(one, low, high, box.below, box.above)) - logs)
-
-
-def barrier_gradient(box: _Box, low: Entries, high: Entries, mu: Array) -> Entries:
-    """Gradient of `_barrier`."""
-
-    def one(a: Array, b: Array, l: Array, h: Array) -> Array:
-        lower = jnp.where(l, -1 / a + jnp.where(h, 0.0, _KAPPA_D), 0.0)
-        upper = jnp.where(h, 1 / b - jnp.where(l, 0.0, _KAPPA_D), 0.0)
-        return mu * (lower + upper)
-
-    return _tree(one, low, high, box.below, box.above)
-
-
-def _longest(gap_low: Entries, gap_high: Entries, dw: Entries, box: _Box, tau: Array) -> Array:
-    """The longest step, up to 1, that keeps the fraction 1 - tau of each distance (eq. 15a)."""
-
-    def one(a: Array, b: Array, d: Array, l: Array, h: Array) -> Array:
-        low = jnp.where(l & (d < 0), -tau * a / jnp.where(d < 0, d, -1.0), jnp.inf)
-        high = jnp.where(h & (d > 0), tau * b / jnp.where(d > 0, d, 1.0), jnp.inf)
-        return jnp.min(jnp.minimum(low, high), initial=1.0)
-
-    steps = jax.tree_util.tree_leaves(_tree(one, gap_low, gap_high, dw, box.below, box.above))
-    return jnp.min(jnp.stack(steps))
-
-
-def _longest_dual(z: Entries, dz: Entries, tau: Array) -> Array:
-    one = lambda z, d: jnp.min(
-        jnp.where(d < 0, -tau * z / jnp.where(d < 0, d, -1.0), jnp.inf), initial=1.0
-    )
-    return jnp.min(jnp.stack(jax.tree_util.tree_leaves(_tree(one, z, dz))))
 
 
 def _where(condition: Array, a: Any, b: Any) -> Any:
@@ -252,15 +164,15 @@ def _augment(filter: _Filter, theta: Array, phi: Array, add: Array) -> _Filter:
 
 
 def optimality_error(
-    box: _Box, gradient: Entries, w: Entries, y: Rows, zl: Entries, zu: Entries, c: Rows
+    box: Box, gradient: Entries, w: Entries, y: Rows, zl: Entries, zu: Entries, c: Rows
 ) -> Callable[[Array], Array]:
     """mu -> E_mu of eq. (5): the worst scaled violation of the perturbed conditions. `gradient`:
     of the Lagrangian without its bounds."""
     net = _tree(lambda g, a, b: g - a + b, gradient, zl, zu)
     net = _tree(lambda g, given: jnp.where(given, 0.0, g), net, box.given)
     low, high = distances(box, w)
-    z = _total(zl) + _total(zu)
-    duals = _total(_tree(jnp.abs, y)) + z
+    z = total(zl) + total(zu)
+    duals = total(_tree(jnp.abs, y)) + z
     s_d = jnp.maximum(_S_MAX, duals / (_count(y) + 2 * _count(w))) / _S_MAX
     s_d = jnp.minimum(s_d, _S_D_MAX)
     s_c = jnp.maximum(_S_MAX, z / (2 * _count(w))) / _S_MAX
@@ -277,7 +189,7 @@ def optimality_error(
 
 def minimise(program: Transcription, bounds: Bounds, start: Start, options: Options) -> Solution:
     """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
-    box = _Box(*map(flattened, boxed(bounds)))
+    box = Box(*map(flattened, boxed(bounds)))
     dtype = program.dtype
     w, net = inside(box, flattened(start.w), options.push), flattened(start.net)
     mu = jnp.asarray(options.mu, dtype)
@@ -303,7 +215,7 @@ def minimise(program: Transcription, bounds: Bounds, start: Start, options: Opti
     return Solution(w, end.y, zl, zu, end.mu, end.status, end.k, end.error, _largest(c))
 
 
-def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _State:
+def _pass(program: Transcription, box: Box, options: Options, s: _State) -> _State:
     """One step of any kind, unless none is needed any more."""
     at = _evaluated(program, box, s)
     now = at.error(jnp.zeros_like(s.mu))
@@ -320,7 +232,7 @@ def _pass(program: Transcription, box: _Box, options: Options, s: _State) -> _St
 
 
 class _Move(NamedTuple):
-    """A `kkt.Step`, its change of the unknowns as one vector."""
+    """A `newton.Step`, its change of the unknowns as one vector."""
 
     primal: Array
     dual: Rows
@@ -338,20 +250,20 @@ class _Here(NamedTuple):
     error: Callable[[Array], Array]
 
 
-def _evaluated(program: Transcription, box: _Box, s: _State) -> _Here:
+def _evaluated(program: Transcription, box: Box, s: _State) -> _Here:
     w = program.shaped(s.w)
     nodes, ends = program.derivatives(w)
     f, c = program.objective_and_residual(w, (nodes.value, ends.value))
-    lagrangian = flattened(kkt.gradient(program, nodes, ends, w, s.y))
+    lagrangian = flattened(newton.gradient(program, nodes, ends, w, s.y))
     error = optimality_error(box, lagrangian, s.w, s.y, s.zl, s.zu, c)
     return _Here(nodes, ends, f, c, *distances(box, s.w), error)
 
 
 def _step(
-    program: Transcription, box: _Box, options: Options, s: _State, at: _Here, error_now: Array
+    program: Transcription, box: Box, options: Options, s: _State, at: _Here, error_now: Array
 ) -> tuple[_State, Array, Array]:
     """A step of the kind `s.mode`; its regularisation and length."""
-    newton, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
+    regularly, restore, estimate = (s.mode == kind for kind in (_NEWTON, _RESTORE, _ESTIMATE))
     nodes, ends, f, c, low, high, error = at
     gap = complementarity(box, low, high, s.zl, s.zu)
 
@@ -365,9 +277,9 @@ def _step(
     slacks = flattened(Primal(*(jnp.full_like(getattr(w_now, k), on[k]) for k in on)))
     sigma = program.shaped(jnp.where(estimate, slacks, s.zl / low + s.zu / high))
     at_nodes, at_ends = hessians
-    system = kkt.System(nodes, ends, at_nodes, at_ends, sigma, program.shaped(box.given))
-    gradient = flattened(kkt.gradient(program, nodes, ends, w_now, _tree(jnp.zeros_like, s.y)))
-    segments = kkt.eliminate(program, system)
+    system = newton.System(nodes, ends, at_nodes, at_ends, sigma, program.shaped(box.given))
+    gradient = flattened(newton.gradient(program, nodes, ends, w_now, _tree(jnp.zeros_like, s.y)))
+    segments = elimination.eliminate(program, system)
     rho = 1e2 * (1 + _largest(hessians))
 
     # Regularised until the inertia is right (algorithm IC).
@@ -392,11 +304,11 @@ def _step(
     # complementarity found and lowered when its problem is solved to its own size (eq. 7).
     least = options.tolerance / 10
     falls = error_now <= _FALL * jnp.max(s.errors)
-    free = newton & (delta == 0) & falls & (s.mu <= _NEAR)
+    free = regularly & (delta == 0) & falls & (s.mu <= _NEAR)
     errors = jnp.where(free, jnp.roll(s.errors, 1).at[0].set(error_now), s.errors)
-    held = jnp.where(newton & s.free & ~free, jnp.maximum(least, 0.8 * gap), s.mu)
+    held = jnp.where(regularly & s.free & ~free, jnp.maximum(least, 0.8 * gap), s.mu)
     lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
-    ready = lambda mu: newton & ~free & (error(mu) <= _KAPPA_EPS * mu) & (mu > least)
+    ready = lambda mu: regularly & ~free & (error(mu) <= _KAPPA_EPS * mu) & (mu > least)
     mu = jax.lax.while_loop(ready, lower, held)
     tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(free, error_now, mu))
     # What was refused under another barrier says nothing of this one.
@@ -406,10 +318,10 @@ def _step(
     bare = gradient - s.zl + s.zu
     was = _where(flat, _tree(jnp.zeros_like, s.y), s.y)
 
-    def load(c: Rows, mu: Array) -> kkt.Load:
-        barrier = jnp.where(restore, 0.0, gradient) + mu * pull
-        rows = c._replace(path=c.path + kkt.COMPLIANCE * was.path)
-        return kkt.Load(program.shaped(jnp.where(estimate, bare, barrier)), rows)
+    def load(c: Rows, mu: Array) -> newton.Load:
+        with_barrier = jnp.where(restore, 0.0, gradient) + mu * pull
+        rows = c._replace(path=c.path + newton.COMPLIANCE * was.path)
+        return newton.Load(program.shaped(jnp.where(estimate, bare, with_barrier)), rows)
 
     # Changes of the bounds' multipliers with a step.
     rate = lambda mu, z, a, dw, on, sign: jnp.where(on, mu / a - z - sign * z / a * dw, 0.0)
@@ -422,8 +334,8 @@ def _step(
         """Mehrotra's rule: the barrier falls as much as the step without one would make it."""
         one = jnp.ones_like(mu)
         dzl, dzu = duals(jnp.zeros_like(mu), step.primal)
-        alpha = _longest(low, high, step.primal, box, one)
-        alpha_z = jnp.minimum(_longest_dual(s.zl, dzl, one), _longest_dual(s.zu, dzu, one))
+        alpha = longest_step(low, high, step.primal, box, one)
+        alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, one), longest_dual_step(s.zu, dzu, one))
         ahead = distances(box, _move(s.w, alpha, step.primal))
         zl, zu = _move(s.zl, alpha_z, dzl), _move(s.zu, alpha_z, dzu)
         left = complementarity(box, *ahead, zl, zu) / jnp.where(gap > 0, gap, 1.0)
@@ -432,7 +344,7 @@ def _step(
         return jnp.clip(gap * left**3, jnp.maximum(least, floor), _MU_MAX)
 
     # The filter line search: the full step, then its second-order correction, then halves.
-    theta, logs = _norm1(c), _barrier(box, s.w, jnp.ones_like(mu))
+    theta, logs = _norm1(c), barrier_value(box, s.w, jnp.ones_like(mu))
 
     def slope_of(mu: Array, d: Array) -> Array:
         return jnp.dot(gradient + mu * pull, d)
@@ -446,7 +358,7 @@ def _step(
         steep = jnp.where(slope < 0, -slope, 0.0)
         w = _move(s.w, length, d)
         f_new, c = program.objective_and_residual(program.shaped(w))
-        theta_new, phi_new = _norm1(c), f_new + _barrier(box, w, mu)
+        theta_new, phi_new = _norm1(c), f_new + barrier_value(box, w, mu)
         sane = jnp.isfinite(theta_new) & jnp.isfinite(phi_new) & (theta_new <= s.theta_max)
         switch = alpha * steep**_S_PHI > _DELTA * theta**_S_THETA
         f_type = (slope < 0) & switch & (theta <= s.theta_min)
@@ -465,7 +377,7 @@ def _step(
         right = load(target, jnp.where(probe, 0.0, mu))
         solved = kkt.solve(program, system, segments, factor, right)
         step = _Move(flattened(solved.primal), solved.dual)
-        length = _longest(low, high, step.primal, box, tau)
+        length = longest_step(low, high, step.primal, box, tau)
         first = _where(k == 0, (step, length), first)
         ok, f_type, c_new, theta_new = judge(
             mu, first[1], slope_of(mu, first[0].primal), step.primal, length
@@ -473,7 +385,7 @@ def _step(
         ok = ok & _finite(step) & ~probe
         mu = jnp.where(probe & regular & _finite(step), probed(step), mu)
         worse = (theta_new >= theta) & jnp.isfinite(theta_new)
-        again = probe | ((k == 0) & newton & regular & ~ok & worse)
+        again = probe | ((k == 0) & regularly & regular & ~ok & worse)
         corrected = _tree(lambda a, b: length * a + b, c, c_new)
         target = _where(probe, target, corrected)
         return k + 1, mu, target, first, (step, length), ok, f_type, again
@@ -503,7 +415,7 @@ def _step(
 
     # Move.
     dzl, dzu = duals(mu, d)
-    alpha_z = jnp.minimum(_longest_dual(s.zl, dzl, tau), _longest_dual(s.zu, dzu, tau))
+    alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, tau), longest_dual_step(s.zu, dzu, tau))
     w = _move(s.w, alpha, d)
     low, high = distances(box, w)
     keep = lambda z, a, on: jnp.where(
@@ -522,15 +434,15 @@ def _step(
     evaluate = lambda: program.objective_and_residual(program.shaped(new_w))
     f_at, c_at = jax.lax.cond(restore, evaluate, lambda: (f, c))  # asked after restoration alone
     theta_at = _norm1(c_at)
-    phi_at = f_at + _barrier(box, new_w, mu)
+    phi_at = f_at + barrier_value(box, new_w, mu)
     home = (theta_at <= 0.9 * s.theta_entry) & _acceptable(filter, theta_at, phi_at)
     home = accepted & restore & (home | (_largest(c_at) <= options.tolerance / 10))
     failed = ~accepted & ~estimate
-    into, stuck = failed & newton, failed & restore
+    into, stuck = failed & regularly, failed & restore
     feasible = _largest(c) <= jnp.maximum(1e-8, options.tolerance)
     mode = jnp.where((restore & ~home) | into, _RESTORE, _NEWTON)
     mode = jnp.where(home, _ESTIMATE, mode)
-    filter = _augment(filter, theta, f + mu * logs, (accepted & newton & ~f_type) | into)
+    filter = _augment(filter, theta, f + mu * logs, (accepted & regularly & ~f_type) | into)
     status = jnp.where(stuck, jnp.where(feasible, STALLED, INFEASIBLE), RUNNING)
     status = jnp.where(into & feasible, STALLED, status)
     status = jnp.where((s.k + 1 >= options.max_iterations) & (status == RUNNING), TOO_MANY, status)

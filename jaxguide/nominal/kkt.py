@@ -10,59 +10,26 @@ The inertia of the whole is right, so that the step descends, if every Cholesky 
 and the last system has as many negative eigenvalues as multipliers (Haynsworth).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from jaxguide.nominal.transcription import Ends, Nodes, Primal, Rows, Transcription
+from jaxguide.nominal.elimination import (
+    Segments,
+    basic,
+    gram,
+    on_diagonal,
+    over_segments,
+    spring,
+)
+from jaxguide.nominal.newton import COMPLIANCE, Load, Step, System, product
+from jaxguide.nominal.transcription import Primal, Rows, Transcription
 
-COMPLIANCE = 1e-8  # of path constraints: an equality is a spring of stiffness 1/this
 _SOFT = 1e-11
-_STIFF = 1e16  # of what holds a given control
 _REFINEMENTS, _ENOUGH = 2, 1e-12
-
-
-class System(NamedTuple):
-    """The matrix: derivatives at the iterate, and the barrier's curvature."""
-
-    nodes: Nodes
-    ends: Ends
-    node_hessian: Float[Array, "segment node in in"]
-    end_hessian: Float[Array, "in in"]
-    sigma: Primal  # z/(w - l) + z/(u - w)
-    given: Primal  # bool: entries that must not move
-
-
-class Load(NamedTuple):
-    """The right-hand side, negated: the gradient without its constraint terms, and residuals."""
-
-    force: Primal
-    residual: Rows
-
-
-class Step(NamedTuple):
-    """Change of the unknowns, and the multipliers after it."""
-
-    primal: Primal
-    dual: Rows
-
-
-class Segments(NamedTuple):
-    """States and controls after each segment's start, linear in v = (start, z, clock, parameters),
-    where z are the entries that the defects leave free, scaled by `size`."""
-
-    basis: Float[Array, "segment row row"]  # L and U of the basic entries
-    order: Int[Array, "segment xu"]  # the basic entries first
-    place: Int[Array, "segment xu"]  # where in that order an entry is
-    size: Float[Array, "segment xu"]
-    X: Float[Array, "segment after n v"]
-    U: Float[Array, "segment node m v"]
-    T: Float[Array, "segment node in v"]  # the nodes' inputs
-    W: Float[Array, "segment node in in"]  # Hessian, springs and barrier of the nodes' inputs
-    H: Float[Array, "segment v v"]  # the same, and the barrier of the states, of v
 
 
 class _Stage(NamedTuple):
@@ -91,133 +58,6 @@ class Factor(NamedTuple):
     held: Bool[Array, " k"]
 
 
-def over_segments(f: Any, items: Any) -> Any:
-    """`f` of every segment in turn: LAPACK under `vmap` may hang, and gains nothing on CPU."""
-    if jax.tree_util.tree_leaves(items)[0].shape[0] == 1:
-        out = f(jax.tree_util.tree_map(lambda a: a[0], items))
-        return jax.tree_util.tree_map(lambda a: a[None], out)
-    return jax.lax.map(f, items)
-
-
-def eliminate(program: Transcription, system: System) -> Segments:
-    """The defects' null space, by LU: stable however unstable the dynamics are, where following
-    the states from their start would not be: of states and controls alike, pivoting makes those
-    basic that the defects determine best."""
-    rule, size = program.rule, program.sizes
-    n, m, C, S, dtype = size.n, size.m, size.nodes, size.segments, system.sigma.x.dtype
-    A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
-    rows, support = A.shape
-    diagonal = jnp.einsum("rp,ab->rapb", A, jnp.eye(n, dtype=dtype))
-    own = slice(rule.first, rule.first + C)
-    count = rows * n
-    # Entries that a barrier holds count for little, so that the reduced Hessian is well scaled.
-    flat = lambda x, u: jnp.concatenate([x.reshape(S, -1), u.reshape(S, -1)], axis=1)
-    weight = jnp.sqrt(1 + flat(system.sigma.x, _on_controls(system)))
-
-    def one(item: tuple) -> tuple:
-        F, weight = item
-        F = F[:, :n]
-        G = diagonal.at[:, :, own].add(-jnp.einsum("rk,kab->rakb", B, F[:, :, :n]))
-        to_u = -jnp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(count, -1)
-        to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(count, -1)
-        start, G = G[:, :, 0].reshape(count, n), G[:, :, 1:].reshape(count, -1)
-        G = jnp.concatenate([G, to_u], axis=1) / weight[None]
-        lu, order = _lu_with_order(G.T)
-        basis = lu[:count]
-        place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
-        free = -solve_triangular(basis, lu[count:].T, trans=1, lower=True, unit_diagonal=True)
-        follow = -_basic(basis, jnp.concatenate([start, to_clock], axis=1))
-        one = jnp.eye(free.shape[1], dtype=dtype)
-        V = jnp.concatenate([
-            jnp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
-            jnp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
-        ])[place]  # fmt: skip
-        return basis, order, place, V / weight[:, None]
-
-    basis, order, place, V = over_segments(one, (system.nodes.jacobian, weight))
-    nv = V.shape[2]
-    split = (support - 1) * n
-    X, U = V[:, :split].reshape(S, support - 1, n, nv), V[:, split:].reshape(S, C, m, nv)
-    start = jnp.broadcast_to(jnp.eye(n, nv, dtype=dtype), (S, 1, n, nv))
-    x = jnp.concatenate([start, X], axis=1)[:, own]
-    rest = system.nodes.jacobian.shape[3] - n - m
-    clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
-    T = jnp.concatenate([x, U, clock], axis=2)
-    return Segments(basis, order, place, weight, X, U, T, *_quadratic(program, system, X, U, T))
-
-
-def _quadratic(
-    program: Transcription, system: System, X: Array, U: Array, T: Array
-) -> tuple[Array, Array]:
-    """`W` and `H` of Segments."""
-    rule, n, inputs = program.rule, program.sizes.n, T.shape[2]
-    stiffness, _ = _spring(system)
-    h_q = system.nodes.jacobian[:, :, n + 1 :]
-    W = system.node_hessian + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
-    W = W + _on_diagonal(_on_controls(system), n, inputs)
-    # Where every point after the first is a node, its barrier joins the node's own Hessian.
-    sigma = jnp.pad(system.sigma.x, ((0, 0), (1, 0), (0, 0)))
-    own = slice(rule.first, rule.first + program.points)
-    if own.stop == sigma.shape[1]:
-        H = _gram(T, _times(W + _on_diagonal(sigma[:, own], 0, inputs), T))
-    else:
-        H = _gram(T, _times(W, T)) + _gram(X, system.sigma.x[..., None] * X)
-    if program.arcwise is not None:
-        of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
-        H = H + _gram(U, of_columns(U))
-    return W, H
-
-
-def _times(W: Array, T: Array) -> Array:
-    return jnp.einsum("skab,skbv->skav", W, T)
-
-
-def _gram(a: Array, b: Array) -> Float[Array, "segment v v"]:
-    flat = lambda a: a.reshape(a.shape[0], -1, a.shape[3])
-    return jnp.einsum("siv,siw->svw", flat(a), flat(b))
-
-
-def _on_diagonal(diagonal: Float[Array, "segment node k"], first: int, inputs: int) -> Array:
-    """`diagonal` of some of each node's inputs as a matrix of all of them."""
-    room = (first, inputs - first - diagonal.shape[2])
-    whole = jnp.pad(diagonal, ((0, 0), (0, 0), room))
-    return whole[..., None] * jnp.eye(inputs, dtype=diagonal.dtype)[None, None]
-
-
-def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
-    """L and U of the rows of `a` in the `order` that pivoting gives them, in one array.
-
-    The order is read off a further column, which holds the rows' numbers: (L U)_last, rounded. XLA
-    finds it from LAPACK's exchanges one by one, which took longer than the factorisation.
-    """
-    rows, columns = a.shape
-    numbers = jnp.arange(rows, dtype=a.dtype)[:, None]
-    lu = jax.lax.linalg.lu(jnp.concatenate([a, numbers], axis=1))[0]
-    k = min(rows, columns + 1)
-    lower = jnp.tril(lu[:, :k], -1) + jnp.eye(rows, k, dtype=a.dtype)
-    order = jnp.round(lower @ lu[:k, columns])
-    return lu[:, :columns], jnp.clip(order, 0, rows - 1).astype(jnp.int32)
-
-
-def _basic(basis: Array, b: Array) -> Array:
-    """The basic entries that make the defects `b`, the others zero."""
-    y = solve_triangular(basis, b, trans=1)
-    return solve_triangular(basis, y, trans=1, lower=True, unit_diagonal=True)
-
-
-def _on_controls(system: System) -> Array:
-    """Barrier curvature of the controls; given ones hardly move."""
-    return jnp.where(system.given.u, _STIFF, system.sigma.u)
-
-
-def _spring(system: System) -> tuple[Array, Array]:
-    """Stiffness of the path rows once their slacks are eliminated, and the slacks' share."""
-    sigma, fixed = system.sigma.path, system.given.path
-    flexible = jnp.where(fixed, 0.0, 1 / jnp.where(sigma > 0, sigma, 1.0))
-    stiffness = jnp.where((sigma > 0) | fixed, 1 / (flexible + COMPLIANCE), 0.0)
-    return stiffness, jnp.where(fixed, 0.0, 1 / (1 + COMPLIANCE * sigma))
-
-
 def factorise(
     program: Transcription, system: System, segments: Segments, delta: Array, rho: Array
 ) -> tuple[Factor, Bool[Array, ""]]:
@@ -225,9 +65,9 @@ def factorise(
     size = program.sizes
     n, W = size.n, segments.W
     everywhere = jnp.broadcast_to(delta, (*W.shape[:2], size.m))
-    W = W + _on_diagonal(everywhere, n, W.shape[2])
+    W = W + on_diagonal(everywhere, n, W.shape[2])
     regular = lambda: (
-        segments.H + delta * (_gram(segments.X, segments.X) + _gram(segments.U, segments.U))
+        segments.H + delta * (gram(segments.X, segments.X) + gram(segments.U, segments.U))
     )
     H = jax.lax.cond(delta > 0, regular, lambda: segments.H)
     stages, P, convex = _sweep(program, segments, H, rho)
@@ -328,7 +168,7 @@ def apply(
     force = force._replace(u=jnp.where(system.given.u, 0.0, force.u))
     own = slice(rule.first, rule.first + C)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
-    stiffness, share = _spring(system)
+    stiffness, share = spring(system)
     pushed = stiffness * residual.path + share * force.path
 
     # What the states are with all of v at zero, and the forces that this and the load leave.
@@ -341,7 +181,7 @@ def apply(
 
     def particular(item: tuple) -> Array:
         basis, _, place, weight, c = item
-        moved = jnp.zeros_like(weight).at[: len(c)].set(-_basic(basis, c))
+        moved = jnp.zeros_like(weight).at[: len(c)].set(-basic(basis, c))
         return moved[place] / weight
 
     factors = (segments.basis, segments.order, segments.place, segments.size)
@@ -432,63 +272,6 @@ def apply(
         jnp.where(system.given.end, 0.0, d_end),
     )
     return Step(primal, Rows(rows, path, nu_))
-
-
-def product(program: Transcription, system: System, delta: Array, step: Step) -> Load:
-    """The matrix times a step, without elimination: what refinement measures by."""
-    n = program.sizes.n
-    dw, y = step
-    J, rule = system.nodes.jacobian, program.rule
-    A, B = (jnp.asarray(a, delta.dtype) for a in (rule.A, rule.B))
-    dq, db = program.inputs(dw), program.end_inputs(dw)
-    on_q, on_b, on_support = forces(program, system.nodes, system.ends, y, 0.0)
-    on_q = on_q + jnp.einsum("skab,skb->ska", system.node_hessian, dq)
-    on_b = on_b + system.end_hessian @ db
-    force = gather(program, dw, on_q, on_b, on_support)
-    force = force._replace(u=force.u + program.roughness(dw.u))
-    springs = lambda f, s, d, g: jnp.where(g, 0.0, f + (s + delta) * d)
-    own = jax.tree_util.tree_map(springs, force, system.sigma, dw, system.given)
-    slack = lambda y, s, d, g: jnp.where(g, 0.0, -y + s * d)
-    force = own._replace(
-        path=slack(y.path, system.sigma.path, dw.path, system.given.path),
-        end=slack(y.end, system.sigma.end, dw.end, system.given.end),
-    )
-    e_b = system.ends.jacobian[1:]
-    defect = jnp.einsum("rp,spn->srn", A, program.support(dw))
-    defect = defect - jnp.einsum("rk,skna,ska->srn", B, J[:, :, :n], dq)
-    path = jnp.einsum("skha,ska->skh", J[:, :, n + 1 :], dq) - dw.path - COMPLIANCE * y.path
-    return Load(force, Rows(defect, path, e_b @ db - dw.end))
-
-
-def forces(
-    program: Transcription, nodes: Nodes, ends: Ends, y: Rows, cost: float
-) -> tuple[Array, Array, Array]:
-    """Derivatives of `cost` f + y^T c by the nodes' inputs, the endpoint inputs and, of A X alone,
-    the support points."""
-    n = program.sizes.n
-    weights = program.node_weights(y).at[:, :, n].set(cost)
-    on_q = jnp.einsum("sko,skoa->ska", weights, nodes.jacobian)
-    on_b = cost * ends.jacobian[0] + y.end @ ends.jacobian[1:]
-    A = jnp.asarray(program.rule.A, y.defect.dtype)
-    return on_q, on_b, jnp.einsum("rp,srn->spn", A, y.defect)
-
-
-def gather(
-    program: Transcription, like: Primal, on_q: Array, on_b: Array, on_support: Array
-) -> Primal:
-    """`forces` on the unknowns themselves."""
-
-    def spread(w: Primal) -> tuple[Array, Array, Array]:
-        return program.inputs(w), program.end_inputs(w), program.support(w)
-
-    return jax.linear_transpose(spread, like)((on_q, on_b, on_support))[0]
-
-
-def gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Rows) -> Primal:
-    """Of the Lagrangian f + y^T c, from Jacobians at hand."""
-    on_unknowns = gather(program, w, *forces(program, nodes, ends, y, 1.0))
-    on_controls = on_unknowns.u + program.roughness(w.u)
-    return on_unknowns._replace(u=on_controls, path=-y.path, end=-y.end)
 
 
 def solve(

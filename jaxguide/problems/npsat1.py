@@ -37,7 +37,8 @@ class NPSAT1(Problem):
     )
     control_bounds = (-33.0, 33.0)
     reference = Reference(
-        112.0520402913, 1e-9, "Newton on 14 switching times", "Ross, Sekhavat, Fleming & Gong (2006)",
+        112.0520402913, 1e-9, "Newton on 14 switching times",
+        "Ross, Sekhavat, Fleming & Gong (2006)",
         trap="B is given in gauss; mgl wants g = 9.81",
     )  # fmt: skip
 
