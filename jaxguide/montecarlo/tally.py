@@ -85,9 +85,9 @@ def tile_moments(deviations: np.ndarray) -> np.ndarray:
     return np.concatenate([[len(deviations)], deviations.sum(axis=0), products.ravel()])
 
 
-def count_in(histogram: np.ndarray, deviations: np.ndarray, scale: np.ndarray) -> None:
-    """Adds each column of `deviations` to its row of `histogram`."""
-    bits = np.ascontiguousarray(deviations.T / scale[:, None]).view(np.int64)
+def count_in(histogram: np.ndarray, deviations: np.ndarray) -> None:
+    """Adds each column of `deviations`, in units of their scale, to its row of `histogram`."""
+    bits = np.ascontiguousarray(deviations.T).view(np.int64)
     key = np.clip(((bits & (2**63 - 1)) >> (52 - _BITS)) - _BASE, 0, _SPAN - 1)
     key = np.where(bits < 0, _SPAN - 1 - key, _SPAN + key)
     for row, keys in zip(histogram, key, strict=True):
