@@ -15,12 +15,12 @@ from typing import Any
 from cyclopts import CycloptsError
 from rich.console import Console
 
-from jaxguide.cli import checking, solving, sweeping
+from jaxguide.cli import checking, reporting, solving, sweeping
 from jaxguide.cli.app import Common, app
 
 COMMANDS = (
     *(solving.problems, solving.reproduce, solving.solve, solving.gains, solving.fly),
-    *(sweeping.sweep, sweeping.rerun),
+    *(sweeping.sweep, sweeping.rerun, reporting.report),
     checking.doctor,
 )
 

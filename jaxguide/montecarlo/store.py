@@ -202,6 +202,15 @@ def opened(path: Path) -> Any:
     return xr.merge(parts).assign_attrs(attrs)
 
 
+def histograms(path: Path) -> np.ndarray:
+    """(k, BINS): the histogram of every quantity over all cases of the sweep stored at `path`."""
+    array: Any = _zarr().open_group(path, mode="r")["partial/histogram"]
+    total = np.zeros(array.shape[1:], np.int64)
+    for k in range(array.shape[0]):
+        total += array[k]
+    return total
+
+
 def described(path: Path) -> dict[str, Any]:
     """The attributes of the store at `path`: "sweep", its manifest; "about"; "summary" if whole.
 
@@ -243,8 +252,9 @@ class Totals:
 
     def add(self, k: int, sums: dict[str, np.ndarray]) -> None:
         self._moments[k] = sums["moments"]
-        for name in sums.keys() - {"moments", "worst"}:
+        for name in sums.keys() - {"moments", "worst", "unit"}:
             self._others[name] = self._others.get(name, 0) + sums[name]
+        self._others["unit"] = sums["unit"]  # of every chunk the same
         worst = [self._others["worst"]] if "worst" in self._others else []
         self._others["worst"] = merged(*worst, sums["worst"])
 

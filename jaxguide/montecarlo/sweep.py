@@ -128,7 +128,7 @@ def sweep(
 
     began = time.perf_counter()
     if todo and scheduler is None:
-        _ = tiles.edges  # compiles, by flying a tile
+        _ = tiles.bins  # compiles, by flying a tile
     compile_s = time.perf_counter() - began
     began, flown = time.perf_counter(), 0
     meter = NoProgress() if progress is None else progress
@@ -249,8 +249,8 @@ def _statistics(tiles: Tiles, totals: dict[str, np.ndarray], flown: int) -> dict
     codes = totals["codes"]
     good = int(codes[code(RESULTS.successful)])
     n = len(tiles.order.mission.plant.state_names)
-    scale, variance = tally.scale, np.diag(tally.covariance)
-    shares = importance.first_order(totals["bins"], variance, scale)
+    variance = np.diag(tally.covariance)
+    shares = importance.first_order(totals["bins"], variance, totals["unit"])
     return {
         "flown": flown,
         "sampling": tiles.order.sampling,
@@ -261,6 +261,8 @@ def _statistics(tiles: Tiles, totals: dict[str, np.ndarray], flown: int) -> dict
         },
         "success_rate": good / flown,
         "success_rate_bounds": wilson_bounds(good, flown),
+        "quantities": list(tiles.names),
+        "reference": {"centre": tally.centre.tolist(), "scale": tally.scale.tolist()},
         "percentiles": tally.summary(tiles.names),
         "nominal_final_state": tiles.centre.tolist(),
         "linear_covariance": tiles.covariance.tolist(),

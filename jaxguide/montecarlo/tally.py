@@ -94,6 +94,12 @@ def count_in(histogram: np.ndarray, deviations: np.ndarray) -> None:
         np.add.at(row, keys, 1)
 
 
+def edges_of_bins() -> np.ndarray:
+    """(BINS + 1,): where the bins of a histogram begin and end, in units of the scale."""
+    positive = _edge(np.arange(_SPAN + 1))
+    return np.concatenate([-positive[::-1], positive[1:]])
+
+
 def _edge(key: Any) -> Any:
     """Lower end of the bin `key` of positive numbers."""
     return ((np.asarray(key, np.int64) + _BASE) << (52 - _BITS)).view(float)

@@ -87,9 +87,14 @@ class Tiles:
         return np.append(centre, end), np.append(size, abs(end) * 1e-3)
 
     @functools.cached_property
-    def edges(self) -> np.ndarray:
-        """Bins of every drawn number, by what tile 0 drew, its lanes beyond the last case too."""
-        return importance.edges_of(self._draws(self._whole(0)))
+    def bins(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edges of the bins of every drawn number, and a size of every quantity's deviations: by
+        tile 0, its lanes beyond the last case too. Where a law takes all first-order effects away,
+        linear covariance knows no size."""
+        rows = self._whole(0)
+        good = rows["result"] == code(RESULTS.successful)
+        size = self._deviations(rows)[good].std(axis=0) if good.any() else np.ones(len(self.names))
+        return importance.edges_of(self._draws(rows)), np.where(size > 0, size, 1.0)
 
     @property
     def linear_shares(self) -> dict[str, Any]:
@@ -136,36 +141,42 @@ class Tiles:
         parts = [rows[f"draw:{p}"].reshape(len(rows["result"]), -1) for p in self._leaves_drawn]
         return np.concatenate(parts, axis=1, dtype=float) if parts else np.zeros((0, 0))
 
+    def _deviations(self, rows: dict[str, np.ndarray]) -> np.ndarray:
+        """(cases, k): every quantity of `names`, less its reference."""
+        more = [rows[name] for name in ("miss", "final_time") if name in rows]
+        return np.column_stack([rows["final_state"], *more]).astype(float) - self.reference[0][None]
+
     def chunk(self, parts: list[dict[str, np.ndarray]], first: int, each: int) -> tuple[dict, dict]:
         """Rows of at most `each` tiles from `first` on, one after another, and their sums.
 
         **Raises:** `RuntimeError` where a case was not flown with what was drawn for it.
         """
-        centre, scale = self.reference
+        scale, (edges, size) = self.reference[1], self.bins
         k = len(self.names)
         sums = {
             "moments": np.zeros((each, 1 + k + k * k)),
             "histogram": np.zeros((k, BINS), np.int64),
             "codes": np.zeros(len(RESULTS._name_to_item), np.int64),  # pyright: ignore
-            "bins": np.zeros((len(self.edges), importance.SLOTS, 1 + k), np.int64),
+            "bins": np.zeros((len(edges), importance.SLOTS, 1 + k), np.int64),
+            "unit": size,
         }
         tables = []
         for i, rows in enumerate(parts):
             start = (first + i) * self.order.tile
             self._check_applied(rows, start)
             good = rows["result"] == code(RESULTS.successful)
-            more = [rows[name] for name in ("miss", "final_time") if name in rows]
-            deviations = np.column_stack([rows["final_state"], *more]).astype(float) - centre[None]
+            deviations = self._deviations(rows)
             # Without endpoint constraints, what lies furthest from the undispersed end is worst.
-            ends = deviations / scale[None]
-            measure = rows["miss"] if self._targets else np.abs(ends).max(axis=1)
+            measure = rows.get("miss", np.abs(deviations / scale[None]).max(axis=1))
             tables.append(ranking.worst(measure.astype(float), start, rows["result"]))
-            deviations, ends = deviations[good], ends[good]
+            deviations = deviations[good]
             sums["moments"][i] = tile_moments(deviations)
             sums["codes"] += np.bincount(rows["result"], minlength=len(sums["codes"]))
-            count_in(sums["histogram"], ends)
-            if len(self.edges):
-                sums["bins"] += importance.bin_sums(self._draws(rows)[good], ends, self.edges)
+            count_in(sums["histogram"], deviations / scale[None])
+            if len(edges):
+                sums["bins"] += importance.bin_sums(
+                    self._draws(rows)[good], deviations / size[None], edges
+                )
         sums["worst"] = ranking.merged(*tables)
         return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, sums
 
