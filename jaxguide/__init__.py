@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jaxguide.laws.suboptimal import NeighboringSuboptimal as NeighboringSuboptimal
     from jaxguide.laws.suboptimal import TimeToGo as TimeToGo
     from jaxguide.laws.suboptimal import TimeToGoGains as TimeToGoGains
+    from jaxguide.montecarlo.compare import compare as compare
     from jaxguide.montecarlo.covariance import linear_covariance as linear_covariance
     from jaxguide.montecarlo.dispersions import LogNormal as LogNormal
     from jaxguide.montecarlo.dispersions import MultivariateNormal as MultivariateNormal
@@ -109,6 +110,7 @@ _HOME = {
     "Uniform": "montecarlo.dispersions",
     "bellman": "bellman",
     "certify": "certificate",
+    "compare": "montecarlo.compare",
     "dispersions_from": "montecarlo.written",
     "gain_schedule": "neighboring.gains",
     "linear_covariance": "montecarlo.covariance",

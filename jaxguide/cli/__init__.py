@@ -20,7 +20,7 @@ from jaxguide.cli.app import Common, app
 
 COMMANDS = (
     *(solving.problems, solving.reproduce, solving.solve, solving.gains, solving.fly),
-    *(sweeping.sweep, sweeping.rerun, reporting.report),
+    *(sweeping.sweep, sweeping.rerun, reporting.report, reporting.export, reporting.compare),
     checking.doctor,
 )
 

@@ -4,6 +4,7 @@ on machines of one kind. Host only."""
 import functools
 import hashlib
 import inspect
+import json
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def manifest(order: Order) -> dict[str, Any]:
     mission = {
         name: digest(getattr(order.mission, name)) for name in order.mission.__dataclass_fields__
     }
-    spread = {str(path): digest(value) for path, value in order.dispersions.items()}
+    spread = {str(path): _told(path, value) for path, value in order.dispersions.items()}
     return {
         "cases": order.cases,
         "seed": order.seed,
@@ -34,6 +35,14 @@ def manifest(order: Order) -> dict[str, Any]:
         "mission": mission,
         "dispersions": spread,
     }
+
+
+def _told(path: Any, distribution: Any) -> str:
+    """Of a distribution that can be written, what is written: read from a file, it is the same."""
+    written = as_written({path: distribution})
+    if written is None:
+        return digest(distribution)
+    return hashlib.sha256(json.dumps(written, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def about(order: Order) -> dict[str, Any]:

@@ -82,6 +82,22 @@ class PercentileWithin(Stop):
             )
 
 
+def rule(text: str) -> Stop:
+    """A rule from "success:WIDTH" or "QUANTITY:PERCENT:WIDTH", such as "miss:99:1e-6".
+
+    **Raises:** `ValueError` for another form.
+    """
+    parts = text.split(":")
+    try:
+        if parts[0] == "success" and len(parts) == 2:
+            return SuccessWithin(float(parts[1]))
+        if len(parts) == 3:
+            return PercentileWithin(parts[0], float(parts[1]), float(parts[2]))
+    except ValueError as e:
+        raise ValueError(f"stop is {text!r}: {e}") from e
+    raise ValueError(f'stop is {text!r}; give "success:0.001" or "miss:99:1e-6", say.')
+
+
 def _positive(rule: str, width: float, confidence: float) -> None:
     if not width > 0:
         raise ValueError(f"{rule}: width is {width}; give a number > 0.")

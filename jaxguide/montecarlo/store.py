@@ -331,16 +331,18 @@ def _digest(values: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _same(manifest: dict[str, Any], found: dict[str, Any], path: Path) -> None:
-    flat = lambda d: dict(_leaves(d))
-    ours, theirs = flat(manifest), flat(found)
-    differ = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
-    if differ:
-        told = ", ".join(
-            f"{k} ({_short(theirs.get(k))}, now {_short(ours.get(k))})" for k in differ
-        )
+    told = differences(manifest, found)
+    if told:
         raise ValueError(
             f"{path} was made by another sweep: {told}. Give another directory, or what made it."
         )
+
+
+def differences(ours: dict[str, Any], theirs: dict[str, Any]) -> str:
+    """What `theirs` has that `ours` has not, by name; "" where they are the same."""
+    now, was = dict(_leaves(ours)), dict(_leaves(theirs))
+    differ = sorted(k for k in now.keys() | was.keys() if now.get(k) != was.get(k))
+    return ", ".join(f"{k} ({_short(was.get(k))}, now {_short(now.get(k))})" for k in differ)
 
 
 def _leaves(d: dict[str, Any], prefix: str = "") -> Any:

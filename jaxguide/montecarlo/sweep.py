@@ -21,9 +21,10 @@ from jaxguide.montecarlo.rollouts import dimensions, draw
 from jaxguide.montecarlo.sampling import SAMPLINGS
 from jaxguide.montecarlo.statistics import wilson_bounds
 from jaxguide.montecarlo.stopping import LOOK, Stop, fitting
-from jaxguide.montecarlo.store import Memory, Store, Totals
+from jaxguide.montecarlo.store import Memory, Store, Totals, differences
 from jaxguide.montecarlo.tally import Tally
 from jaxguide.montecarlo.tiles import TILE, Order, Tiles, code, message
+from jaxguide.montecarlo.written import dispersions_from
 from jaxguide.progress import NoProgress
 from jaxguide.types import RESULTS
 
@@ -271,6 +272,31 @@ def _statistics(tiles: Tiles, totals: dict[str, np.ndarray], flown: int) -> dict
         "linear_importance": tiles.linear_shares,
         "worst": ranking.told(totals["worst"], message),
     }
+
+
+def again(
+    told: dict[str, Any], mission: Mission, dispersions: dict[Any, Distribution], store: Any
+) -> tuple[dict[Any, Distribution], str]:
+    """The dispersions of the stored sweep that `told` describes, and what of the software has
+    changed since ("" if nothing): its own where it could write them, else `dispersions`.
+
+    **Raises:** `ValueError` naming what differs, where `mission` is not what was flown.
+    """
+    about = told.get("about", {})
+    if about.get("written"):
+        dispersions = dispersions_from(about["dispersions"])
+    order = Order(mission, dispersions, told["seed"], told["cases"], told["tile"], told["sampling"])
+    now = manifest(order)
+    pick = lambda of, names: {name: of[name] for name in names}
+    flown = ("mission", "dispersions", "dtype")
+    changed = differences(pick(now, flown), pick(told, flown))
+    if changed:
+        raise ValueError(
+            f"{store} was flown by another mission: {changed}. Check out what made it, or sweep "
+            "again into another directory."
+        )
+    software = differences(pick(now, ("jax", "jaxguide")), pick(told, ("jax", "jaxguide")))
+    return dispersions, f"made by other software: {software}" if software else ""
 
 
 def cast(mission: Mission, dtype: str) -> Mission:
