@@ -59,7 +59,6 @@ def compare(a: Path, b: Path, *, quantity: str = "miss", common: Common = Common
     data = paired(opened(a), opened(b), quantity)
     table = Table("", "", box=None, show_header=False)
     for key, value in data.items():
-        table.add_row(
-            key.replace("_", " "), f"{value:.6g}" if isinstance(value, float) else str(value)
-        )
+        text = f"{value:.6g}" if isinstance(value, float) else str(value)
+        table.add_row(key.replace("_", " "), text)
     return Outcome(data, [table])

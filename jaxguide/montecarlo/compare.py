@@ -1,4 +1,4 @@
-"""Two sweeps with the same draws, case by case: what one law does better than another. Host only."""
+"""Two sweeps with the same draws, case by case: what one law does better. Host only."""
 
 import math
 from typing import Any

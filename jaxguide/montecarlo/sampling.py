@@ -42,11 +42,10 @@ class Sobol(Points):
     def __call__(self, case: Any, dtype: Any) -> Float[Array, " d"]:
         case = jnp.asarray(case).astype(jnp.uint32)
         gray = case ^ (case >> jnp.uint32(1))
-        x = self.shift
-        for j in range(_BITS):
-            bit = (gray >> jnp.uint32(j)) & jnp.uint32(1)
-            x = x ^ (bit * self.directions[j])
-        return _inside(x, dtype)
+        bits = (gray >> jnp.arange(_BITS, dtype=jnp.uint32)) & jnp.uint32(1)
+        chosen = bits[:, None] * self.directions
+        x = jax.lax.reduce(chosen, np.uint32(0), jax.lax.bitwise_xor, (0,))
+        return _inside(x ^ self.shift, dtype)
 
 
 class LatinHypercube(Points):
@@ -105,13 +104,12 @@ def points(sampling: str, key: Array, dimensions: int, cases: int) -> Points | N
         return LatinHypercube(k_within, mixers, cases)
     plain = jnp.asarray(directions(dimensions))
     lower = jax.random.bits(k_points, (_BITS, dimensions), jnp.uint32)
-    scrambled = jnp.zeros_like(plain)
-    for i in range(_BITS):  # bit i from the top: row i of the matrix, one on the diagonal
-        place = jnp.uint32(_BITS - 1 - i)
-        above = jnp.uint32((2**i - 1) << (_BITS - i))
-        row = (lower[i] & above) | (jnp.uint32(1) << place)
-        odd = jax.lax.population_count(plain & row[None, :]) & jnp.uint32(1)
-        scrambled = scrambled | (odd << place)
+    # Row i of the matrix gives bit i from the top: ones on the diagonal, chance above it.
+    place = np.arange(_BITS, dtype=np.uint32)[::-1, None]
+    one = np.uint32(1) << place
+    row = (lower & jnp.asarray(~(one | (one - np.uint32(1))))) | jnp.asarray(one)
+    odd = jax.lax.population_count(plain[None] & row[:, None]) & jnp.uint32(1)
+    scrambled = jnp.sum(odd << jnp.asarray(place)[:, :, None], axis=0, dtype=jnp.uint32)
     return Sobol(scrambled, jax.random.bits(k_within, (dimensions,), jnp.uint32))
 
 

@@ -38,7 +38,7 @@ def stationed(client: Client, order: Order) -> Iterator[str]:
 
 def fly(name: str, tiles: range, each: int, k: int) -> tuple[int, dict, dict]:
     """In a worker: number, rows and sums of the chunk `k` of `tiles`."""
-    ready = get_worker().plugins[name].tiles
+    ready = get_worker().plugins[name].tiles  # pyright: ignore[reportAttributeAccessIssue]
     flown = over_cores(ready.fly, tiles, len(ready.devices))
     rows, sums = ready.chunk(list(flown), tiles.start, each)
     return k, rows, sums

@@ -35,7 +35,7 @@ class SuccessWithin(Stop):
     often, so a rate at the stop is a little more certain than it would be from one look.
     """
 
-    width: float = eqx.field(static=True)
+    width: float | int = eqx.field(static=True)
     confidence: float = eqx.field(static=True, default=0.95)
 
     def __check_init__(self):
@@ -58,8 +58,8 @@ class PercentileWithin(Stop):
     """
 
     quantity: str = eqx.field(static=True)
-    percent: float = eqx.field(static=True)
-    width: float = eqx.field(static=True)
+    percent: float | int = eqx.field(static=True)
+    width: float | int = eqx.field(static=True)
     confidence: float = eqx.field(static=True, default=0.95)
 
     def __check_init__(self):
@@ -98,7 +98,7 @@ def rule(text: str) -> Stop:
     raise ValueError(f'stop is {text!r}; give "success:0.001" or "miss:99:1e-6", say.')
 
 
-def _positive(rule: str, width: float, confidence: float) -> None:
+def _positive(rule: str, width: float | int, confidence: float) -> None:
     if not width > 0:
         raise ValueError(f"{rule}: width is {width}; give a number > 0.")
     if not 0 < confidence < 1:

@@ -7,10 +7,14 @@ group `histories` holds some flights in full; the root's attribute `summary`, wr
 what the sweep found.
 """
 
+import contextlib
+import errno
 import hashlib
 import json
 import math
+import os
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +24,7 @@ from jaxguide.montecarlo.ranking import merged
 
 FORMAT = 2
 _DIGEST = 32  # bytes
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Store:
@@ -101,7 +106,27 @@ class Store:
         beside.rename(self.path)
 
     def write(self, k: int, rows: dict[str, np.ndarray], sums: dict[str, np.ndarray]) -> None:
-        """Chunk `k`: its cases and its sums, then its digest."""
+        """Chunk `k`: its cases and its sums, then its digest.
+
+        **Raises:** `OSError` where it does not fit; the chunks before it are kept.
+        """
+        with self._room():
+            self._write(k, rows, sums)
+
+    @contextlib.contextmanager
+    def _room(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as e:
+            if e.errno not in _FULL:
+                raise
+            raise OSError(
+                e.errno,
+                f"{self.path}: {os.strerror(e.errno)}. What was written is kept: free some space, "
+                "or move the store to where there is, and go on with resume=True (--resume).",
+            ) from e
+
+    def _write(self, k: int, rows: dict[str, np.ndarray], sums: dict[str, np.ndarray]) -> None:
         at = slice(k * self.chunk, min((k + 1) * self.chunk, self.cases))
         for name, values in rows.items():
             self.root[name][at] = values[: at.stop - at.start]
@@ -157,7 +182,14 @@ class Store:
             return False
 
     def finish(self, summary: dict[str, Any], histories: dict[str, Any]) -> None:
-        """What the sweep found, and flights in full: name -> (dimensions, values)."""
+        """What the sweep found, and flights in full: name -> (dimensions, values).
+
+        **Raises:** `OSError` where it does not fit; the cases are kept.
+        """
+        with self._room():
+            self._finish(summary, histories)
+
+    def _finish(self, summary: dict[str, Any], histories: dict[str, Any]) -> None:
         if histories:
             group = self.root.create_group("histories", overwrite=True)
             for name, (dims, values) in histories.items():

@@ -167,8 +167,8 @@ class Tiles:
             good = rows["result"] == code(RESULTS.successful)
             deviations = self._deviations(rows)
             # Without endpoint constraints, what lies furthest from the undispersed end is worst.
-            measure = rows.get("miss", np.abs(deviations / scale[None]).max(axis=1))
-            tables.append(ranking.worst(measure.astype(float), start, rows["result"]))
+            far = rows["miss"] if "miss" in rows else np.abs(deviations / scale[None]).max(axis=1)
+            tables.append(ranking.worst(far.astype(float), start, rows["result"]))
             deviations = deviations[good]
             sums["moments"][i] = tile_moments(deviations)
             sums["codes"] += np.bincount(rows["result"], minlength=len(sums["codes"]))
@@ -226,7 +226,8 @@ def _program(backend: str) -> Any:
         given: Any, key: Array, index: Array, leaves: tuple, treedef: Any, tile: int
     ) -> dict[str, Any]:
         rest = jax.tree_util.tree_unflatten(treedef, leaves)
-        return _fly_tile(*eqx.combine(given, rest), key, index, tile)
+        mission, dispersions, prepared, spread_by = eqx.combine(given, rest)
+        return _fly_tile(mission, dispersions, prepared, spread_by, key, index, tile)
 
     return jax.jit(tile_of, static_argnums=(3, 4, 5), compiler_options=compiler_options())
 

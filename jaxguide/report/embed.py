@@ -19,7 +19,7 @@ _COLOURS = {
     COLOURS[1].lower(): "var(--blue)",
     COLOURS[2].lower(): "var(--red)",
 }
-PAGE_STYLE = STYLE | {
+PAGE_STYLE: dict[Any, Any] = STYLE | {
     "text.color": INK,
     "axes.labelcolor": INK,
     "axes.edgecolor": INK,
@@ -37,7 +37,7 @@ PAGE_STYLE = STYLE | {
 
 def drawn(draw: Callable[..., Figure | None], *args: Any, title: str) -> str:
     """What `draw` draws, as inline SVG with `title` for readers who cannot see it; "" for None."""
-    settings = PAGE_STYLE | {"svg.hashsalt": title}  # ids of one page must differ
+    settings: dict[Any, Any] = PAGE_STYLE | {"svg.hashsalt": title}  # ids of one page must differ
     with mpl.rc_context(settings):
         figure = draw(*args)
         if figure is None:
