@@ -17,6 +17,7 @@ from jaxguide.montecarlo.cores import over_cores
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.histories import chosen, in_full
 from jaxguide.montecarlo.identity import about, manifest
+from jaxguide.montecarlo.memory import trim
 from jaxguide.montecarlo.rollouts import dimensions, draw
 from jaxguide.montecarlo.sampling import SAMPLINGS
 from jaxguide.montecarlo.statistics import wilson_bounds
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 CHUNK = 65_536  # cases written at once
 _KEEP = ("all", "summary")
+_MANY = 1_000_000  # cases from which memory is worth the few milliseconds of giving it back
 _MOST = 1e9  # bytes of results that a sweep keeps in memory
 
 
@@ -92,7 +94,8 @@ def sweep(
     the flights in full; attributes `flown`, `rollouts_per_s` (warm), `compile_s`, `percentiles`
     (with confidence bounds), `success_rate` with Wilson bounds, `failures`, the linear covariance
     beside the sampled one, `importance` of each dispersed number (first-order Sobol indices with
-    the half width of their 95 % bounds) beside `linear_importance`, and the `worst` cases.
+    the half width of their 95 % bounds, from the first 64 tiles) beside `linear_importance`, and
+    the `worst` cases.
 
     **Error:** percentiles to 2^-12 of their distance from the undispersed flight.
 
@@ -109,6 +112,8 @@ def sweep(
         half = jnp.full(dimensions(mission, dispersions), 0.5)
         jax.eval_shape(lambda: draw(mission, dispersions, jax.random.key(0), half))
 
+    if cases >= _MANY:
+        trim()
     order = Order(mission, dispersions, seed, cases, tile, sampling)
     tiles = Tiles(order, devices)
     if stop is not None:
@@ -130,6 +135,8 @@ def sweep(
     began = time.perf_counter()
     if todo and scheduler is None:
         _ = tiles.bins  # compiles, by flying a tile
+        if cases >= _MANY:
+            trim()
     compile_s = time.perf_counter() - began
     began, flown = time.perf_counter(), 0
     meter = NoProgress() if progress is None else progress

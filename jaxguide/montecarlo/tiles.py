@@ -173,7 +173,7 @@ class Tiles:
             sums["moments"][i] = tile_moments(deviations)
             sums["codes"] += np.bincount(rows["result"], minlength=len(sums["codes"]))
             count_in(sums["histogram"], deviations / scale[None])
-            if len(edges):
+            if len(edges) and first + i < importance.TILES:
                 sums["bins"] += importance.bin_sums(
                     self._draws(rows)[good], deviations / size[None], edges
                 )
