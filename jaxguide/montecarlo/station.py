@@ -9,6 +9,7 @@ import jax
 from dask.distributed import Client, WorkerPlugin, get_worker
 
 from jaxguide.montecarlo.cores import over_cores
+from jaxguide.montecarlo.tally import packed
 from jaxguide.montecarlo.tiles import Order, Tiles
 
 
@@ -36,9 +37,13 @@ def stationed(client: Client, order: Order) -> Iterator[str]:
         client.unregister_worker_plugin(name)
 
 
-def fly(name: str, tiles: range, each: int, k: int) -> tuple[int, dict, dict]:
-    """In a worker: number, rows and sums of the chunk `k` of `tiles`."""
+def fly(
+    name: str, tiles: range, each: int, k: int, kept: tuple[str, ...]
+) -> tuple[int, dict, dict]:
+    """In a worker: number, rows (those that are `kept`) and sums of the chunk `k` of `tiles`, the
+    histogram packed."""
     ready = get_worker().plugins[name].tiles  # pyright: ignore[reportAttributeAccessIssue]
     flown = over_cores(ready.fly, tiles, len(ready.devices))
     rows, sums = ready.chunk(list(flown), tiles.start, each)
-    return k, rows, sums
+    sums["histogram"] = packed(sums["histogram"])
+    return k, {row: rows[row] for row in kept}, sums

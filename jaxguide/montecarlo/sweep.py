@@ -142,7 +142,7 @@ def sweep(
     meter = NoProgress() if progress is None else progress
     state = meter.init()
     totals = Totals()
-    coming = _flown(tiles, todo, each, scheduler)
+    coming = _flown(tiles, todo, each, tuple(variables), scheduler)
     coming = coming if stop is None else _in_order(coming, todo)
     waiting, ended = set(todo), cases
     try:
@@ -222,12 +222,13 @@ def _check_memory(cases: int, variables: dict[str, Any]) -> None:
 
 
 def _flown(
-    tiles: Tiles, todo: list[int], each: int, scheduler: str | None
+    tiles: Tiles, todo: list[int], each: int, kept: tuple[str, ...], scheduler: str | None
 ) -> Generator[tuple[int, dict, dict]]:
     """Number, rows and sums of each chunk of `todo`."""
     of_chunk = lambda k: range(k * each, min((k + 1) * each, tiles.count))
     if scheduler is not None:
-        yield from over_workers(tiles.order, {k: of_chunk(k) for k in todo}, each, scheduler)
+        chunks = {k: of_chunk(k) for k in todo}
+        yield from over_workers(tiles.order, chunks, each, kept, len(tiles.names), scheduler)
         return
     flown = over_cores(tiles.fly, (i for k in todo for i in of_chunk(k)))
     for k in todo:

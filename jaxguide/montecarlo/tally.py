@@ -94,6 +94,21 @@ def count_in(histogram: np.ndarray, deviations: np.ndarray) -> None:
         np.add.at(row, keys, 1)
 
 
+def packed(histogram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places and counts of the bins that are not empty: a chunk's go over a network in a tenth of
+    the bytes or less."""
+    at = np.flatnonzero(histogram)
+    return at.astype(np.int32), histogram.ravel()[at].astype(np.int32)
+
+
+def unpacked(packet: Any, quantities: int) -> np.ndarray:
+    """The histogram (quantities, BINS) that `packed` packed."""
+    at, counts = packet
+    histogram = np.zeros(quantities * BINS, np.int64)
+    histogram[at] = counts
+    return histogram.reshape(quantities, BINS)
+
+
 def edges_of_bins() -> np.ndarray:
     """(BINS + 1,): where the bins of a histogram begin and end, in units of the scale."""
     positive = _edge(np.arange(_SPAN + 1))
