@@ -1,6 +1,6 @@
 """(c) Whole sweeps, drawing and statistics included: rate, memory, bits, and workers.
 
-    python bench/sweeps.py [--smoke] [--cases N] [--rounds R]
+    python bench/sweeps.py [--smoke] [--cases N] [--rounds R] [--plain]
 
 Earth-Mars in float64 and float32, `keep="summary"`, in turn with its peers, which are looked for
 beside the checkout (`../shared/bench`) or at $JAXGUIDE_PEERS: `rollout_limit.c` (hand-vectorised C
@@ -8,7 +8,8 @@ that draws nothing and keeps nothing; gcc with the flags named in it) and `noc_n
 (SciPy's solver in a Python loop, its gains' time left out). Memory is the highest resident size of
 a process that flies N cases (10 million, say), less that of one that has imported JAX and this
 package. Weak scaling: Dask workers of one thread, the same number of cases each; they share the
-machine's cores, so more workers than cores cannot be faster. One JSON object on stdout.
+machine's cores, so more workers than cores cannot be faster. XLA's options are those of `jaxguide
+sweep`, or with `--plain` its own. One JSON object on stdout.
 """
 
 import argparse
@@ -21,6 +22,8 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+from jaxguide.montecarlo.flags import deciding, set_for_flights
 
 PEERS = Path(os.environ.get("JAXGUIDE_PEERS", Path(__file__).parents[2] / "shared" / "bench"))
 FLAGS = ["-O3", "-march=native", "-ffast-math", "-fopenmp"]
@@ -107,7 +110,10 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="few flights and no workers")
     parser.add_argument("--cases", type=int, default=10_000_000, help="of the memory's sweep")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--plain", action="store_true", help="without XLA's options for flights")
     options = parser.parse_args()
+    if not options.plain:
+        set_for_flights()  # before JAX starts; the processes started here have them too
     flights = 8192 if options.smoke else 524_288
     rounds = 1 if options.smoke else options.rounds
 
@@ -124,6 +130,7 @@ def main() -> None:
         "jax": jax.__version__,
         "device": str(jax.devices()[0]),
         "cores": os.cpu_count(),
+        "xla": deciding(),
         "flights": flights,
     }
     ours: dict[str, list[float]] = {"float64": [], "float32": []}

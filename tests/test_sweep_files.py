@@ -6,6 +6,7 @@
 import csv
 import dataclasses
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -19,7 +20,9 @@ from test_sweep_store import flown, mission
 
 import jaxguide as jg
 from jaxguide import cli, problems
+from jaxguide.cli import sweeping
 from jaxguide.export import export
+from jaxguide.montecarlo import flags
 from jaxguide.montecarlo.rollouts import case_key, draw
 from jaxguide.montecarlo.written import as_written
 from jaxguide.report import html, write
@@ -283,3 +286,25 @@ def test_the_store_is_read_by_the_command_line(mission, tmp_path, monkeypatch, c
     monkeypatch.setattr(problems, "mission", lambda name: heavier)
     code, told = run("sweep", "rerun", path, "33")
     assert code == 1 and "flown by another mission: mission: plant (" in told["error"]
+
+
+def test_options_of_xla(mission, tmp_path, monkeypatch):
+    """Asked for once, the user's own left alone; a store says them, since they decide roundings."""
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    assert flags.deciding() == ""  # as many devices as one likes: the same bits
+    flags.set_for_flights()
+    flags.set_for_flights()
+    assert flags.deciding() == flags.FLIGHTS
+    flags.take("--xla_other=1")
+    assert os.environ["XLA_FLAGS"] == "--xla_other=1 --xla_force_host_platform_device_count=2"
+    path = tmp_path / "a"
+    flown(mission, store=path, label="mine")
+    sweeping.options_of_xla(sweeping.sweep, {})
+    with pytest.raises(ValueError, match="made by another sweep: xla"):
+        flown(mission, store=path, label="mine", resume=True)
+    sweeping.options_of_xla(sweeping.rerun, {"store": path})
+    assert flags.deciding() == "--xla_other=1"
+    flown(mission, store=path, label="mine", resume=True)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_extra_options=mine")
+    flags.set_for_flights()
+    assert flags.deciding() == "--xla_backend_extra_options=mine"

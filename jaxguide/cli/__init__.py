@@ -43,6 +43,8 @@ def run(argv: list[str]) -> int:
     if command not in COMMANDS:  # --help, --version
         command(*bound.args, **bound.kwargs)
         return 0
+    if "jax" not in sys.modules:
+        sweeping.options_of_xla(command, bound.arguments)
     configure()
     stdout = sys.stdout
     try:

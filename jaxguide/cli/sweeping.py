@@ -1,5 +1,6 @@
 """`jaxguide sweep` and `sweep rerun`: many flights, and one of them again."""
 
+import contextlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -121,6 +122,20 @@ def _shown(data: dict[str, Any]) -> Table:
         else:
             table.add_row(key, Text(short(value)))
     return table
+
+
+def options_of_xla(command: Any, arguments: dict[str, Any]) -> None:
+    """Before JAX starts: what makes flights fast; for a case again, what its store was made with,
+    since nominal and gains would otherwise differ in their last digits."""
+    from jaxguide.montecarlo import flags
+
+    if command is sweep:
+        flags.set_for_flights()
+    elif command is rerun:
+        from jaxguide.montecarlo.store import described
+
+        with contextlib.suppress(ValueError):  # which the command itself will tell
+            flags.take(described(arguments["store"])["sweep"].get("xla", ""))
 
 
 @sweeps.command

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxguide.montecarlo import flags
 from jaxguide.montecarlo.tiles import Order
 from jaxguide.montecarlo.written import as_written
 
@@ -31,6 +32,7 @@ def manifest(order: Order) -> dict[str, Any]:
         "sampling": order.sampling,
         "dtype": str(order.mission.initial_state.dtype),
         "jax": jax.__version__,
+        "xla": flags.deciding(),
         "jaxguide": _package(),
         "mission": mission,
         "dispersions": spread,
