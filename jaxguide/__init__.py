@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jaxguide.laws.suboptimal import NeighboringSuboptimal as NeighboringSuboptimal
     from jaxguide.laws.suboptimal import TimeToGo as TimeToGo
     from jaxguide.laws.suboptimal import TimeToGoGains as TimeToGoGains
+    from jaxguide.montecarlo.compare import compare as compare
     from jaxguide.montecarlo.covariance import linear_covariance as linear_covariance
     from jaxguide.montecarlo.dispersions import LogNormal as LogNormal
     from jaxguide.montecarlo.dispersions import MultivariateNormal as MultivariateNormal
@@ -39,7 +40,10 @@ if TYPE_CHECKING:
     from jaxguide.montecarlo.dispersions import Uniform as Uniform
     from jaxguide.montecarlo.rollouts import rerun as rerun
     from jaxguide.montecarlo.rollouts import rollouts as rollouts
+    from jaxguide.montecarlo.stopping import PercentileWithin as PercentileWithin
+    from jaxguide.montecarlo.stopping import SuccessWithin as SuccessWithin
     from jaxguide.montecarlo.sweep import sweep as sweep
+    from jaxguide.montecarlo.written import dispersions_from as dispersions_from
     from jaxguide.neighboring.gains import GainSchedule as GainSchedule
     from jaxguide.neighboring.gains import gain_schedule as gain_schedule
     from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
@@ -85,6 +89,7 @@ _HOME = {
     "NeighboringSuboptimal": "laws.suboptimal",
     "Normal": "montecarlo.dispersions",
     "OpenLoop": "laws.law",
+    "PercentileWithin": "montecarlo.stopping",
     "PhaseEnds": "nominal.phased",
     "Phased": "nominal.phased",
     "PiecewiseLinear": "nominal.piecewise_linear",
@@ -97,6 +102,7 @@ _HOME = {
     "SolveError": "types",
     "StateAsTime": "nominal.state_as_time",
     "SuboptimalSchedule": "neighboring.suboptimal",
+    "SuccessWithin": "montecarlo.stopping",
     "TimeToGo": "laws.suboptimal",
     "TimeToGoGains": "laws.suboptimal",
     "Trajectory": "trajectory",
@@ -104,6 +110,8 @@ _HOME = {
     "Uniform": "montecarlo.dispersions",
     "bellman": "bellman",
     "certify": "certificate",
+    "compare": "montecarlo.compare",
+    "dispersions_from": "montecarlo.written",
     "gain_schedule": "neighboring.gains",
     "linear_covariance": "montecarlo.covariance",
     "linearize": "neighboring.linearization",
@@ -116,7 +124,7 @@ _HOME = {
     "suboptimal_gains": "neighboring.suboptimal",
     "sweep": "montecarlo.sweep",
 }
-_MODULES = ("plotting", "problems", "reproduce")
+_MODULES = ("export", "plotting", "problems", "report", "reproduce")
 
 
 def __getattr__(name: str) -> object:

@@ -350,10 +350,10 @@ def plot_sweep(dataset: Any, units: Units = None) -> Figure:
                     markeredgewidth=0, rasterized=True, zorder=1,
                 )  # fmt: skip
                 pair = np.ix_([j, i], [j, i])
-                _ellipse(axis, mean[[j, i]], sampled[pair], label="sampled", **line(0))
-                _ellipse(axis, np.zeros(2), linear[pair], label="linear", **line(2))
+                ellipse(axis, mean[[j, i]], sampled[pair], label="sampled", **line(0))
+                ellipse(axis, np.zeros(2), linear[pair], label="linear", **line(2))
             axis.locator_params(nbins=4)
-    _align(axes, [label(name, units, r"\delta ") for name in names])
+    align(axes, [label(name, units, r"\delta ") for name in names])
     handles: dict[str, Any] = {}
     for axis in axes.ravel():
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
@@ -371,7 +371,7 @@ def plot_sweep(dataset: Any, units: Units = None) -> Figure:
     return figure
 
 
-def _align(axes: np.ndarray, texts: list[str]) -> None:
+def align(axes: np.ndarray, texts: list[str]) -> None:
     """Columns share their abscissa, rows of pairs their ordinate; only the outer axes say which."""
     n = len(axes)
     for j in range(n):
@@ -405,7 +405,7 @@ def _histogram(axis: Axes, values: np.ndarray) -> None:
     axis.grid(False)
 
 
-def _ellipse(axis: Axes, centre: np.ndarray, covariance: np.ndarray, **options: Any) -> None:
+def ellipse(axis: Axes, centre: np.ndarray, covariance: np.ndarray, **options: Any) -> None:
     """Three-sigma ellipse of a 2 x 2 covariance."""
     size, vectors = np.linalg.eigh(covariance)
     width, height = 6 * np.sqrt(np.maximum(size[::-1], 0.0))

@@ -32,6 +32,7 @@ LAYERS = (
     "tuning",
     "problems",
     "plotting",
+    "report",
     "reproduce",
     "export",
     "doctor",

@@ -400,7 +400,7 @@ def tallied(values, tile=None):
     histogram = np.zeros((values.shape[1], BINS), np.int64)
     tiles = np.split(values - centre, range(tile, len(values), tile)) if tile else [values - centre]
     for part in tiles:
-        count_in(histogram, part, scale)
+        count_in(histogram, part / scale)
     return Tally(centre, scale, np.array([tile_moments(part) for part in tiles]), histogram)
 
 

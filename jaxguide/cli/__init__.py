@@ -15,12 +15,12 @@ from typing import Any
 from cyclopts import CycloptsError
 from rich.console import Console
 
-from jaxguide.cli import checking, solving, sweeping
+from jaxguide.cli import checking, reporting, solving, sweeping
 from jaxguide.cli.app import Common, app
 
 COMMANDS = (
     *(solving.problems, solving.reproduce, solving.solve, solving.gains, solving.fly),
-    *(sweeping.sweep, sweeping.rerun),
+    *(sweeping.sweep, sweeping.rerun, reporting.report, reporting.export, reporting.compare),
     checking.doctor,
 )
 
@@ -43,6 +43,8 @@ def run(argv: list[str]) -> int:
     if command not in COMMANDS:  # --help, --version
         command(*bound.args, **bound.kwargs)
         return 0
+    if "jax" not in sys.modules:
+        sweeping.options_of_xla(command, bound.arguments)
     configure()
     stdout = sys.stdout
     try:

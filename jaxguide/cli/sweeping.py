@@ -1,5 +1,6 @@
 """`jaxguide sweep` and `sweep rerun`: many flights, and one of them again."""
 
+import contextlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +25,12 @@ def sweep(
     resume: bool = False,
     scheduler: str | None = None,
     dtype: Literal["float64", "float32"] = "float64",
+    dispersions: Path | None = None,
+    sampling: Literal["random", "latin_hypercube", "sobol"] = "random",
+    stop: str | None = None,
     keep: Literal["all", "summary"] = "all",
+    histories: int = 0,
+    failures: int = 0,
     out: Path | None = None,
     common: Common = Common(),
 ) -> Outcome:
@@ -48,8 +54,19 @@ def sweep(
         Address of a Dask scheduler.
     dtype
         Precision of the flights; the nominal and its gains are always float64.
+    dispersions
+        A TOML or YAML file of what to disperse, in place of the problem's own.
+    sampling
+        How cases lie over their distributions: at random, in layers, or evenly (Sobol).
+    stop
+        Stop early when bounds are narrow: "success:0.001" (width of the success rate's bounds) or
+        "miss:99:1e-6" (of the 99th percentile of the miss, or of a state).
     keep
         "summary" keeps statistics and each case's result alone, for millions of cases.
+    histories
+        So many cases, the first, are kept with their whole histories.
+    failures
+        So many of those that failed, too.
     out
         Folder for the figure.
     """
@@ -59,14 +76,26 @@ def sweep(
         raise ValueError("--resume needs the --store to go on with.")
     from jaxguide import problems as library
 
+    rule = None
+    if stop is not None:
+        from jaxguide.montecarlo.stopping import rule as rule_of
+
+        rule = rule_of(stop)
+    if dispersions is None:
+        spread = library.dispersions(name)
+    else:
+        from jaxguide.montecarlo.written import dispersions_from
+
+        spread = dispersions_from(dispersions)
     with waiting(RichProgress(f"mission {name}")):
-        mission, dispersions = library.mission(name), library.dispersions(name)
+        mission = library.mission(name)
     import jaxguide as jg
 
     progress = RichProgress(f"sweep {name}", total=cases, unit="flights")
     options: dict[str, Any] = {"store": store, "scheduler": scheduler, "dtype": dtype}
-    options |= {"keep": keep, "label": name, "resume": resume}
-    dataset = jg.sweep(mission, dispersions, cases, seed, progress=progress, **options)
+    options |= {"keep": keep, "label": name, "resume": resume, "sampling": sampling, "stop": rule}
+    options |= {"histories": histories, "failures": failures}
+    dataset = jg.sweep(mission, spread, cases, seed, progress=progress, **options)
     figures = []
     if out is not None and keep == "all":
         from jaxguide.plotting import plot_sweep
@@ -74,18 +103,47 @@ def sweep(
         figures = [save(plot_sweep(dataset), out, f"{name}-sweep")]
     data = dict(dataset.attrs)
     data |= {"problem": name, "cases": cases, "seed": seed, "dtype": dtype, "figures": figures}
+    return Outcome(data, [_shown(data), *written(figures)])
+
+
+def _shown(data: dict[str, Any]) -> Table:
+    """Numbers by name; dictionaries a line each, lists of dictionaries (the worst cases) too."""
     table = Table("", "", box=None, show_header=False)
+    short = lambda v: f"{v:.6g}" if isinstance(v, float) else str(v)
     for key, value in data.items():
-        if key != "figures":
-            table.add_row(key, Text(f"{value:.6g}" if isinstance(value, float) else str(value)))
-    return Outcome(data, [table, *written(figures)])
+        if key in ("figures", "about", "reference", "quantities"):
+            continue
+        if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
+            for name, inner in value.items():
+                table.add_row(f"{key}: {name}", Text(str(inner)))
+        elif key == "worst":
+            told = ", ".join(f"{w['case']} ({w['measure']:.4g})" for w in value[:5])
+            table.add_row("worst cases", Text(told))
+        else:
+            table.add_row(key, Text(short(value)))
+    return table
+
+
+def options_of_xla(command: Any, arguments: dict[str, Any]) -> None:
+    """Before JAX starts: what makes flights fast; for a case again, what its store was made with,
+    since nominal and gains would otherwise differ in their last digits."""
+    from jaxguide.montecarlo import flags
+
+    if command is sweep:
+        flags.set_for_flights()
+    elif command is rerun:
+        from jaxguide.montecarlo.store import described
+
+        with contextlib.suppress(ValueError):  # which the command itself will tell
+            flags.take(described(arguments["store"])["sweep"].get("xla", ""))
 
 
 @sweeps.command
 def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = Common()) -> Outcome:
     """Fly one case of a stored sweep again, with its history.
 
-    Exits with 1 if its end is not the stored one to 1e-12 of its size (a summary keeps none).
+    Exits with 1 if its end is not the stored one to 1e-12 of its size (a summary keeps none), or if
+    the mission is no longer that of the store.
 
     Parameters
     ----------
@@ -102,13 +160,16 @@ def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = C
     told, of_case = stored(store, case)
     name = told["label"]
     with waiting(RichProgress(f"mission {name}")):
-        mission, dispersions = library.mission(name), library.dispersions(name)
+        mission = library.mission(name)
     import numpy as np
 
     import jaxguide as jg
-    from jaxguide.montecarlo.sweep import cast
+    from jaxguide.montecarlo.sweep import again, cast
 
-    flight = jg.rerun(cast(mission, told["dtype"]), dispersions, told["seed"], case)
+    mission = cast(mission, told["dtype"])
+    dispersions, note = again(told, mission, library.dispersions(name), store)
+    sampled = {"sampling": told["sampling"], "cases": told["cases"]}
+    flight = jg.rerun(mission, dispersions, told["seed"], case, **sampled)
     states = library.get(name).state_names
     figures = []
     if out is not None:
@@ -124,10 +185,11 @@ def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = C
     data = {
         "problem": name, "case": case, "seed": told["seed"], "t": flight.t, "x": flight.x,
         "u": flight.u, "final_state": final, "stored": was, "same": same, "figures": figures,
-        "result": result_of(flight.result),
+        "result": result_of(flight.result), "note": note,
     }  # fmt: skip
     table = Table("", "flown again", "stored", box=None)
     for i, state in enumerate(states):
         old = "not kept" if was is None else f"{float(was[i]):.15g}"
         table.add_row(state, f"{float(final[i]):.15g}", old)
-    return Outcome(data, [table, *written(figures)], same is not False)
+    notes = [Text(note)] if note else []
+    return Outcome(data, [table, *notes, *written(figures)], same is not False)

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
+from jaxguide.montecarlo.tally import unpacked
 from jaxguide.montecarlo.tiles import Order
 
 _AHEAD = 3  # chunks under way, a worker
@@ -12,10 +13,15 @@ _TIMEOUT = 10.0  # seconds until a scheduler that does not answer is given up
 
 
 def over_workers(
-    order: Order, chunks: dict[int, range], each: int, scheduler: str
+    order: Order,
+    chunks: dict[int, range],
+    each: int,
+    kept: tuple[str, ...],
+    quantities: int,
+    scheduler: str,
 ) -> Iterator[tuple[int, dict, dict]]:
-    """Number, rows and sums of each chunk, as they come; those of a worker that dies are flown
-    again by another.
+    """Number, rows (those that are `kept`) and sums of each chunk, as they come; those of a worker
+    that dies are flown again by another.
 
     **Raises:** `ValueError` for a scheduler that does not answer, `RuntimeError` without Dask.
     """
@@ -29,7 +35,7 @@ def over_workers(
 
     with _client(distributed, scheduler) as client, stationed(client, order) as name:
         submit = lambda k: client.submit(
-            fly, name, chunks[k], each, k, retries=_RETRIES, pure=False
+            fly, name, chunks[k], each, k, kept, retries=_RETRIES, pure=False
         )
         left = iter(chunks)
         room = _AHEAD * max(len(client.scheduler_info()["workers"]), 1)
@@ -40,7 +46,7 @@ def over_workers(
             k = flying.pop(future)
             following = itertools.islice(left, 1)
             try:
-                done = future.result()
+                k, rows, sums = future.result()
             # What dies with its worker is computed again by the scheduler, but for results
             # that it had already let go of.
             except distributed.CancelledError:
@@ -49,7 +55,8 @@ def over_workers(
                     raise
                 following = [k]
             else:
-                yield done
+                sums["histogram"] = unpacked(sums["histogram"], quantities)
+                yield k, rows, sums
             for k in following:
                 flying[again := submit(k)] = k
                 coming.add(again)

@@ -1,19 +1,22 @@
 """Distributions of the deviation of any leaf of a Mission."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtri
 from jaxtyping import Array
 
 from jaxguide.types import is_traced
 
 
 class Distribution(eqx.Module):
-    """Abstract: draws deviations of one leaf."""
+    """Abstract: draws deviations of one leaf, from a key or from numbers on (0, 1)."""
+
+    independent: ClassVar[bool] = True  # whether the entries of a draw are
 
     @abc.abstractmethod
     def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
@@ -23,9 +26,20 @@ class Distribution(eqx.Module):
     def covariance(self, size: int, dtype: Any) -> Array:
         """Covariance (size, size) of the flattened draw."""
 
-    def deviation(self, key: Array, leaf: Array) -> Array:
-        """One draw for `leaf`: what is added to it."""
-        return self.sample(key, leaf.shape, leaf.dtype)
+    def quantile(self, u: Array) -> Array:
+        """The draw that `u`, of the leaf's shape and type on (0, 1), stands for: as random as a
+        sample if `u` is uniform.
+
+        **Raises:** `ValueError` where a distribution of the user's own has none.
+        """
+        raise ValueError(
+            f"{type(self).__name__} has no quantile, which evenly spread cases are drawn by; give "
+            'it one, or choose sampling="random".'
+        )
+
+    def deviation(self, key: Array, leaf: Array, u: Array | None = None) -> Array:
+        """One draw for `leaf`, by `u` if given: what is added to it."""
+        return self.sample(key, leaf.shape, leaf.dtype) if u is None else self.quantile(u)
 
     def spread(self, leaf: Array) -> Array:
         """Covariance of the flattened `deviation`."""
@@ -46,6 +60,10 @@ class Normal(Distribution):
         std, mean = _fit(self.std, shape, dtype, "std"), _fit(self.mean, shape, dtype, "mean")
         return mean + std * jax.random.normal(key, shape, dtype)
 
+    def quantile(self, u: Array) -> Array:
+        std = _fit(self.std, u.shape, u.dtype, "std")
+        return _fit(self.mean, u.shape, u.dtype, "mean") + std * ndtri(u)
+
     def covariance(self, size: int, dtype: Any) -> Array:
         return jnp.diag(_fit(self.std, (size,), dtype, "std") ** 2)
 
@@ -63,6 +81,10 @@ class Uniform(Distribution):
     def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
         lo, hi = _fit(self.lo, shape, dtype, "lo"), _fit(self.hi, shape, dtype, "hi")
         return lo + (hi - lo) * jax.random.uniform(key, shape, dtype)
+
+    def quantile(self, u: Array) -> Array:
+        lo = _fit(self.lo, u.shape, u.dtype, "lo")
+        return lo + (_fit(self.hi, u.shape, u.dtype, "hi") - lo) * u
 
     def covariance(self, size: int, dtype: Any) -> Array:
         width = _fit(self.hi, (size,), dtype, "hi") - _fit(self.lo, (size,), dtype, "lo")
@@ -92,6 +114,15 @@ class TruncatedNormal(Distribution):
         std, mean, a, b = self._standard(shape, dtype)
         return mean + std * jax.random.truncated_normal(key, a, b, shape, dtype)
 
+    def quantile(self, u: Array) -> Array:
+        std, mean, a, b = self._standard(u.shape, u.dtype)
+        # In the lower tail, where probabilities have their full precision.
+        flip = a > 0
+        low, high = jnp.where(flip, -b, a), jnp.where(flip, -a, b)
+        p, q = jax.scipy.stats.norm.cdf(low), jax.scipy.stats.norm.cdf(high)
+        z = jnp.clip(ndtri(p + jnp.where(flip, 1 - u, u) * (q - p)), low, high)
+        return mean + std * jnp.where(flip, -z, z)
+
     def covariance(self, size: int, dtype: Any) -> Array:
         std, _, a, b = self._standard((size,), dtype)
         pdf, cdf = jax.scipy.stats.norm.pdf, jax.scipy.stats.norm.cdf
@@ -115,6 +146,9 @@ class LogNormal(Distribution):
         sigma = _fit(self.sigma, shape, dtype, "sigma")
         return jnp.expm1(sigma * jax.random.normal(key, shape, dtype))
 
+    def quantile(self, u: Array) -> Array:
+        return jnp.expm1(_fit(self.sigma, u.shape, u.dtype, "sigma") * ndtri(u))
+
     def covariance(self, size: int, dtype: Any) -> Array:
         square = _fit(self.sigma, (size,), dtype, "sigma") ** 2
         return jnp.diag(jnp.expm1(square) * jnp.exp(square))
@@ -125,14 +159,21 @@ class Relative(Distribution):
 
     distribution: Distribution
 
+    @property
+    def independent(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.distribution.independent
+
     def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
         return self.distribution.sample(key, shape, dtype)
 
     def covariance(self, size: int, dtype: Any) -> Array:
         return self.distribution.covariance(size, dtype)
 
-    def deviation(self, key: Array, leaf: Array) -> Array:
-        return leaf * self.distribution.deviation(key, leaf)
+    def quantile(self, u: Array) -> Array:
+        return self.distribution.quantile(u)
+
+    def deviation(self, key: Array, leaf: Array, u: Array | None = None) -> Array:
+        return leaf * self.distribution.deviation(key, leaf, u)
 
     def spread(self, leaf: Array) -> Array:
         size = leaf.reshape(-1)
@@ -144,6 +185,7 @@ class MultivariateNormal(Distribution):
 
     cov: Any
     mean: Any = 0.0
+    independent: ClassVar[bool] = False
 
     def __check_init__(self):
         if is_traced(self.cov):
@@ -155,15 +197,21 @@ class MultivariateNormal(Distribution):
             raise ValueError(f"MultivariateNormal: cov has a negative eigenvalue:\n{cov}.")
 
     def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
+        return self._coloured(jax.random.normal(key, shape, dtype))
+
+    def quantile(self, u: Array) -> Array:
+        return self._coloured(ndtri(u))
+
+    def _coloured(self, white: Array) -> Array:
         # The symmetric square root also serves a singular covariance.
-        cov = jnp.asarray(self.cov, dtype)
-        if shape != (cov.shape[0],):
+        cov = jnp.asarray(self.cov, white.dtype)
+        if white.shape != (cov.shape[0],):
             raise ValueError(
-                f"MultivariateNormal: cov is {cov.shape}, but the leaf has shape {shape}."
+                f"MultivariateNormal: cov is {cov.shape}, but the leaf has shape {white.shape}."
             )
         values, vectors = jnp.linalg.eigh(cov)
         root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
-        return _fit(self.mean, shape, dtype, "mean") + root @ jax.random.normal(key, shape, dtype)
+        return _fit(self.mean, white.shape, white.dtype, "mean") + root @ white
 
     def covariance(self, size: int, dtype: Any) -> Array:
         return jnp.asarray(self.cov, dtype)

@@ -4,6 +4,7 @@ on machines of one kind. Host only."""
 import functools
 import hashlib
 import inspect
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +12,61 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxguide.montecarlo import flags
 from jaxguide.montecarlo.tiles import Order
+from jaxguide.montecarlo.written import as_written
+
+_RIM = ("reproduce", "cli", "plotting", "report", "export", "doctor", "tuning", "batch", "bellman")
 
 
 def manifest(order: Order) -> dict[str, Any]:
     """Names and digests: code, seed and size, every part of the mission, every dispersion."""
     mission = {
-        name: _digest(getattr(order.mission, name)) for name in order.mission.__dataclass_fields__
+        name: digest(getattr(order.mission, name)) for name in order.mission.__dataclass_fields__
     }
-    spread = {str(path): _digest(value) for path, value in order.dispersions.items()}
+    spread = {str(path): _told(path, value) for path, value in order.dispersions.items()}
     return {
         "cases": order.cases,
         "seed": order.seed,
         "tile": order.tile,
+        "sampling": order.sampling,
         "dtype": str(order.mission.initial_state.dtype),
         "jax": jax.__version__,
+        "xla": flags.deciding(),
         "jaxguide": _package(),
         "mission": mission,
         "dispersions": spread,
     }
 
 
-def _digest(tree: Any) -> str:
+def _told(path: Any, distribution: Any) -> str:
+    """Of a distribution that can be written, what is written: read from a file, it is the same."""
+    written = as_written({path: distribution})
+    if written is None:
+        return digest(distribution)
+    return hashlib.sha256(json.dumps(written, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def about(order: Order) -> dict[str, Any]:
+    """For people: what was flown, and by what it was dispersed."""
+    plant = order.mission.plant
+    numbers = {
+        name: np.asarray(value).tolist()
+        for name in plant.__dataclass_fields__
+        if eqx.is_array_like(value := getattr(plant, name)) and np.ndim(value) < 2
+    }
+    control = [str(name) for name in plant.control_names]
+    return {
+        "plant": {"class": type(plant).__qualname__, "controls": control, **numbers},
+        "law": type(order.mission.law).__qualname__,
+        "sample_interval": float(order.mission.sample_interval),
+        "dispersions": as_written(order.dispersions)
+        or {str(path): repr(value) for path, value in order.dispersions.items()},
+        "written": as_written(order.dispersions) is not None,
+    }
+
+
+def digest(tree: Any) -> str:
     """Of the numbers in `tree`, its structure, and the source of its classes and functions."""
     sha = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -77,7 +111,7 @@ def _source(thing: Any) -> str:
     except (OSError, TypeError):  # built in, or typed at a prompt
         pass
     captured = [cell.cell_contents for cell in getattr(thing, "__closure__", None) or ()]
-    return name + "".join(_digest(value) for value in captured)
+    return name + "".join(digest(value) for value in captured)
 
 
 @functools.cache
@@ -86,7 +120,7 @@ def _package() -> str:
     sha = hashlib.sha256()
     root = Path(__file__).parents[1]
     for file in sorted(root.rglob("*.py")):
-        if file.relative_to(root).parts[0] not in ("reproduce", "cli.py", "plotting.py"):
+        if file.relative_to(root).parts[0].removesuffix(".py") not in _RIM:
             sha.update(file.relative_to(root).as_posix().encode())
             sha.update(file.read_bytes())
     return sha.hexdigest()[:16]

@@ -10,10 +10,15 @@ from jaxtyping import Array
 from jaxguide.flight.mission import Mission, with_leaf
 from jaxguide.flight.simulate import Flight, Prepared, prepare, simulate
 from jaxguide.montecarlo.dispersions import Distribution
+from jaxguide.montecarlo.sampling import points
 
 
-def draw(mission: Mission, dispersions: dict[Any, Distribution], key: Array) -> dict[str, Array]:
+def draw(
+    mission: Mission, dispersions: dict[Any, Distribution], key: Array, u: Array | None = None
+) -> dict[str, Array]:
     """One case's deviations, by path. Each path has its own stream, so adding one moves no other.
+
+    `u` (dimensions,): the case's point on the unit cube, by which it is drawn instead of by `key`.
 
     A tuple of paths is drawn as one vector, their leaves one after another, so that they may be
     correlated (`jg.MultivariateNormal`).
@@ -21,15 +26,19 @@ def draw(mission: Mission, dispersions: dict[Any, Distribution], key: Array) -> 
     **Raises:** `ValueError` for a path that is not one array of the mission, or that comes twice.
     """
     draws: dict[str, Array] = {}
-    for paths, distribution in _ordered(dispersions):
-        leaves = [_leaf(mission, path) for path in paths]
+    used = 0
+    for paths, distribution in ordered(dispersions):
+        leaves = [leaf_at(mission, path) for path in paths]
         stream = jax.random.fold_in(key, _hash(" ".join(paths)))
-        if len(paths) == 1:
-            parts = [distribution.deviation(stream, leaves[0])]
-        else:
-            joined = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
-            cuts = np.cumsum([leaf.size for leaf in leaves])[:-1]
-            parts = jnp.split(distribution.deviation(stream, joined), cuts)
+        whole = leaves[0]
+        if len(paths) > 1:
+            whole = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+        at = None if u is None else u[used : used + whole.size].reshape(whole.shape)
+        at = None if at is None else at.astype(whole.dtype)
+        used += whole.size
+        deviation = distribution.deviation(stream, whole, at)
+        cuts = np.cumsum([leaf.size for leaf in leaves])[:-1]
+        parts = jnp.split(deviation, cuts) if len(paths) > 1 else [deviation]
         for path, leaf, part in zip(paths, leaves, parts, strict=True):
             if path in draws:
                 raise ValueError(f"dispersions: {path!r} is drawn twice; name each leaf once.")
@@ -37,11 +46,16 @@ def draw(mission: Mission, dispersions: dict[Any, Distribution], key: Array) -> 
     return draws
 
 
+def dimensions(mission: Mission, dispersions: dict[Any, Distribution]) -> int:
+    """Numbers that are drawn for a case."""
+    return sum(leaf_at(mission, path).size for paths, _ in ordered(dispersions) for path in paths)
+
+
 def spread(mission: Mission, dispersions: dict[Any, Distribution]) -> list[tuple]:
     """(paths, covariance of their flattened deviations) of each dispersion."""
     out = []
-    for paths, distribution in _ordered(dispersions):
-        leaves = [_leaf(mission, path) for path in paths]
+    for paths, distribution in ordered(dispersions):
+        leaves = [leaf_at(mission, path) for path in paths]
         whole = leaves[0]
         if len(paths) > 1:
             whole = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
@@ -49,7 +63,7 @@ def spread(mission: Mission, dispersions: dict[Any, Distribution]) -> list[tuple
     return out
 
 
-def _ordered(dispersions: dict[Any, Distribution]) -> list[tuple[tuple[str, ...], Distribution]]:
+def ordered(dispersions: dict[Any, Distribution]) -> list[tuple[tuple[str, ...], Distribution]]:
     """By their paths, each a tuple."""
     named = {(k,) if isinstance(k, str) else tuple(k): v for k, v in dispersions.items()}
     return sorted(named.items(), key=lambda item: item[0])
@@ -67,25 +81,29 @@ def rollouts(
     dispersions: dict[Any, Distribution],
     keys: Array,
     save: str = "ends",
+    sampling: str = "random",
 ) -> Flight:
     """Flies one dispersed case per key.
 
     **Arguments:** `dispersions`: dotted path in the mission ("initial_state", "plant.thrust",
     "sensor.noise"), or several as a tuple -> distribution of the deviation; `keys` (B,): one PRNG
-    key a case; `save`: "ends" (default) or "samples".
+    key a case; `save`: "ends" (default) or "samples"; `sampling`: "random", or "latin_hypercube" or
+    "sobol" to spread the B cases evenly over their distributions (randomised by the first key).
 
     **Returns:** a Flight whose arrays have a leading case axis. A case that fails is marked in its
     own `.result`; the others are untouched.
     """
 
     prepared = shared(mission, dispersions)
+    spread_by = points(sampling, keys[0], dimensions(mission, dispersions), keys.shape[0])
 
-    def fly(key: Array) -> Flight:
+    def fly(key: Array, case: Array) -> Flight:
         k_draw, k_noise = jax.random.split(key)
-        flown = apply(mission, draw(mission, dispersions, k_draw))
+        u = None if spread_by is None else spread_by(case, mission.initial_state.dtype)
+        flown = apply(mission, draw(mission, dispersions, k_draw, u))
         return simulate(flown, k_noise, save, prepared)
 
-    return jax.vmap(fly)(keys)
+    return jax.vmap(fly)(keys, jnp.arange(keys.shape[0]))
 
 
 def case_key(seed: Any, case: Any) -> Array:
@@ -94,25 +112,41 @@ def case_key(seed: Any, case: Any) -> Array:
     return jax.random.fold_in(key, case)
 
 
-def rerun(mission: Mission, dispersions: dict[Any, Distribution], seed: int, case: int) -> Flight:
+def rerun(
+    mission: Mission,
+    dispersions: dict[Any, Distribution],
+    seed: int,
+    case: int,
+    sampling: str = "random",
+    cases: int | None = None,
+) -> Flight:
     """Flies case `case` of a sweep with this `seed` again, with its history.
 
+    `sampling`, and for "latin_hypercube" `cases`: those of the sweep.
+
     **Error:** a sweep's program may round differently: its final state to 1e-12 or so, relative.
+
+    **Raises:** `ValueError` without the `cases` that a Latin hypercube needs.
     """
+    if sampling == "latin_hypercube" and cases is None:
+        raise ValueError("rerun: a Latin hypercube depends on its number of cases; pass cases=.")
+    size = dimensions(mission, dispersions)
+    spread_by = points(sampling, case_key(seed, 0), size, case + 1 if cases is None else cases)
+    u = None if spread_by is None else spread_by(case, mission.initial_state.dtype)
     k_draw, k_noise = jax.random.split(case_key(seed, case))
-    flown = apply(mission, draw(mission, dispersions, k_draw))
+    flown = apply(mission, draw(mission, dispersions, k_draw, u))
     return simulate(flown, k_noise, "samples", shared(mission, dispersions))
 
 
 def shared(mission: Mission, dispersions: dict[Any, Distribution]) -> Prepared | None:
     """What all cases have in common, unless the law or its times are themselves dispersed."""
     own = ("law", "sample_interval", "initial_time", "final_time")
-    if any(path.split(".")[0] in own for paths, _ in _ordered(dispersions) for path in paths):
+    if any(path.split(".")[0] in own for paths, _ in ordered(dispersions) for path in paths):
         return None
     return prepare(mission)
 
 
-def _leaf(mission: Mission, path: str) -> Array:
+def leaf_at(mission: Mission, path: str) -> Array:
     found: list[Array] = []
 
     def keep(leaf: Any) -> Any:

@@ -85,13 +85,34 @@ def tile_moments(deviations: np.ndarray) -> np.ndarray:
     return np.concatenate([[len(deviations)], deviations.sum(axis=0), products.ravel()])
 
 
-def count_in(histogram: np.ndarray, deviations: np.ndarray, scale: np.ndarray) -> None:
-    """Adds each column of `deviations` to its row of `histogram`."""
-    bits = np.ascontiguousarray(deviations.T / scale[:, None]).view(np.int64)
+def count_in(histogram: np.ndarray, deviations: np.ndarray) -> None:
+    """Adds each column of `deviations`, in units of their scale, to its row of `histogram`."""
+    bits = np.ascontiguousarray(deviations.T).view(np.int64)
     key = np.clip(((bits & (2**63 - 1)) >> (52 - _BITS)) - _BASE, 0, _SPAN - 1)
     key = np.where(bits < 0, _SPAN - 1 - key, _SPAN + key)
     for row, keys in zip(histogram, key, strict=True):
         np.add.at(row, keys, 1)
+
+
+def packed(histogram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places and counts of the bins that are not empty: a chunk's go over a network in a tenth of
+    the bytes or less."""
+    at = np.flatnonzero(histogram)
+    return at.astype(np.int32), histogram.ravel()[at].astype(np.int32)
+
+
+def unpacked(packet: Any, quantities: int) -> np.ndarray:
+    """The histogram (quantities, BINS) that `packed` packed."""
+    at, counts = packet
+    histogram = np.zeros(quantities * BINS, np.int64)
+    histogram[at] = counts
+    return histogram.reshape(quantities, BINS)
+
+
+def edges_of_bins() -> np.ndarray:
+    """(BINS + 1,): where the bins of a histogram begin and end, in units of the scale."""
+    positive = _edge(np.arange(_SPAN + 1))
+    return np.concatenate([-positive[::-1], positive[1:]])
 
 
 def _edge(key: Any) -> Any:
