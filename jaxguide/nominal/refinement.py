@@ -193,7 +193,7 @@ def structured(
 ) -> tuple[Extremal, float]:
     """The extremal of the structure `found`, and how wrong that is: its complementarity; infinite
     where it is not clear, not resolved or not feasible. Where multipliers tell what is wrong with
-    it, it is corrected by them."""
+    it, all its controls being at bounds, it is corrected by them."""
     junctions, switches = found.junctions, found.switches(problem.m)
     clear = 0 < len(junctions) <= _MOST_JUNCTIONS and switches.any()
     if not clear or isinstance(problem, Endless):
@@ -223,7 +223,9 @@ def structured(
         if max(*left, value.get("path constraints", 0.0)) <= _BEYOND:
             wrong = value["complementarity"]
     watch(Progress(f"free knots, complementarity {wrong:.0e}", exact, error))
-    if corrections and _SOUND < wrong < np.inf:
+    # Singular arcs are wrong in other ways.
+    held = bool(np.all(found.active[:, : problem.m]))
+    if corrections and held and _SOUND < wrong < np.inf:
         better = corrected(exact, found, ends)
         if len(better.junctions) > len(junctions):
             other, less = again(better, corrections=corrections - 1)
