@@ -14,7 +14,7 @@ class Ready(NamedTuple):
     - `steps`, `cases`: what its author found enough. Without dispersions `cases` is 1.
     - `confirm(tuned, cases, seed)`: rows of a table (name -> start, tuned) with true integers on
       fresh cases, and `notes` on what was found.
-    - `cases_matter`: whether it flies dispersed cases at all.
+    - `places(design)`: name -> places on a line, from 0 to 1, to draw before and after.
     """
 
     name: str
@@ -26,6 +26,7 @@ class Ready(NamedTuple):
     steps: int
     cases: int
     confirm: Callable[[Tuned, int, int], "Confirmed"]
+    places: Callable[[Any], dict[str, Any]]
     temperature: Callable[[int], float] | None = None
     compiler_options: dict[str, Any] | None = None
 

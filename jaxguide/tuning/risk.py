@@ -9,6 +9,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
 
+from jaxguide.montecarlo.statistics import normal_quantile
+
 
 def quantile(values: Float[Array, " case"], level: float) -> Float[Array, ""]:
     """The `level` quantile, linear between order statistics.
@@ -82,3 +84,20 @@ def above(value: Any, bound: Any, width: Any = 0.0) -> Float[Array, ""]:
 def _check(level: float, name: str) -> None:
     if not 0 < level < 1:
         raise ValueError(f"{name}: level is {level}; give a fraction in (0, 1), such as 0.99.")
+
+
+def quantile_bounds(
+    values: Any, level: float, confidence: float = 0.95
+) -> tuple[float, float, float]:
+    """(low, quantile, high): distribution-free bounds from order statistics, the number of cases
+    below a quantile being binomial. Host only."""
+    _check(level, "quantile_bounds")
+    ordered = np.sort(np.asarray(values, float))
+    n = ordered.size
+    spread = normal_quantile(0.5 + confidence / 2) * np.sqrt(n * level * (1 - level))
+    low, high = int(np.floor(n * level - spread)) - 1, int(np.ceil(n * level + spread))
+    return (
+        float(ordered[low]) if low >= 0 else -np.inf,
+        float(np.quantile(ordered, level)),
+        float(ordered[high]) if high < n else np.inf,
+    )
