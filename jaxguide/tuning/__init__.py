@@ -21,9 +21,9 @@ from jaxguide.tuning.relaxation import cutoff as cutoff
 from jaxguide.tuning.relaxation import occupancy as occupancy
 from jaxguide.tuning.relaxation import sample_lengths as sample_lengths
 from jaxguide.tuning.relaxation import thinned_weights as thinned_weights
-from jaxguide.tuning.thinned import ThinnedGains as ThinnedGains
 from jaxguide.tuning.risk import above as above
 from jaxguide.tuning.risk import cvar as cvar
 from jaxguide.tuning.risk import quantile as quantile
 from jaxguide.tuning.risk import quantile_bounds as quantile_bounds
 from jaxguide.tuning.risk import smooth_quantile as smooth_quantile
+from jaxguide.tuning.thinned import ThinnedGains as ThinnedGains

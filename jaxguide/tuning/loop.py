@@ -76,7 +76,9 @@ def tune(
         )
     raw = checked(design)
     keys = jax.vmap(lambda k: case_key(seed, k))(jnp.arange(cases))
-    warm = (lambda k: np.asarray(temperature(k), float)) if temperature else (lambda k: np.zeros(()))
+    warm = (
+        (lambda k: np.asarray(temperature(k), float)) if temperature else (lambda k: np.zeros(()))
+    )
 
     def loss(raw: Any, keys: Array, heat: Array) -> tuple[Array, dict[str, Array]]:
         own = values(raw)

@@ -15,6 +15,8 @@ class Ready(NamedTuple):
     - `confirm(tuned, cases, seed)`: rows of a table (name -> start, tuned) with true integers on
       fresh cases, and `notes` on what was found.
     - `places(design)`: name -> places on a line, from 0 to 1, to draw before and after.
+    - `rounded(tuned)`: the design with its count made an integer, to tune what is left; None where
+      there is nothing to round.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Ready(NamedTuple):
     places: Callable[[Any], dict[str, Any]]
     temperature: Callable[[int], float] | None = None
     compiler_options: dict[str, Any] | None = None
+    rounded: Callable[[Tuned], "Ready"] | None = None
 
     def tune(
         self,
@@ -37,7 +40,7 @@ class Ready(NamedTuple):
         seed: int = 0,
         **options: Any,
     ) -> Tuned:
-        """Tunes it; `options` as for `jg.tune`."""
+        """Tunes it, as it is: relaxed, if it is; `options` as for `jg.tune`."""
         given: dict[str, Any] = {
             "steps": self.steps if steps is None else steps,
             "cases": self.cases if cases is None else cases,

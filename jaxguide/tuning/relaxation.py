@@ -18,9 +18,7 @@ from jaxguide.spectral import legendre_matrix, legendre_vandermonde, nodes_lg
 _POINTS = 32  # of the density's quadrature: rounding, for weights of a few modes
 
 
-def sample_lengths(
-    count: Any, most: int, horizon: Any, shape: Any = None
-) -> Float[Array, " most"]:
+def sample_lengths(count: Any, most: int, horizon: Any, shape: Any = None) -> Float[Array, " most"]:
     r"""Lengths of up to `most` samples whose number is the real `count`: `Mission`'s
     `sample_interval`.
 
@@ -100,9 +98,7 @@ def thinned_weights(
     return jnp.sum(both * (1 - share), axis=1) + jnp.sum(both * share, axis=0)
 
 
-def cooling(
-    start: float, end: float, steps: int, hold: float = 0.25
-) -> Callable[[int], float]:
+def cooling(start: float, end: float, steps: int, hold: float = 0.25) -> Callable[[int], float]:
     """A temperature for each step: from `start` to `end` by a constant factor, then `end` for the
     last `hold` of the steps.
 
