@@ -1,6 +1,6 @@
-"""Derivatives of a converged direct solution with respect to its Problem and its mesh, by the implicit
-function theorem on the conditions of the last barrier problem: smooth in every parameter, bound and
-break."""
+"""Derivatives of a converged direct solution with respect to its Problem and its mesh, by the
+implicit function theorem on the conditions of the last barrier problem: smooth in every parameter,
+bound and break."""
 
 from typing import Any
 
