@@ -40,7 +40,7 @@ def counted(
 
     **Returns:** a Count; the best of the rounded one and its two neighbours.
 
-    **Raises:** `ValueError` for a count outside `least` ... `most`, or where no objective is finite.
+    **Raises:** `ValueError` for a count outside `least` ... `most`, or if no objective is finite.
     """
     at = round(float(relaxed))
     if at < least or (most is not None and at > most):

@@ -59,8 +59,8 @@ def tune(
 
     **Returns:** a `Tuned`, with the best design seen.
 
-    **Raises:** `ValueError` for a design with a leaf that is no floating array, is not finite, or on
-    which the objective does not depend; for an objective that is no scalar, or is not finite at the
+    **Raises:** `ValueError` for a design with a leaf that is no floating array, is not finite, or
+    on which the objective does not depend; for an objective that is no scalar, or is not finite at the
     start, naming the leaf. If it stops being finite later the run ends there, with a warning.
     """
     for name, value in (("steps", steps), ("cases", cases)):
@@ -76,9 +76,8 @@ def tune(
         )
     raw = checked(design)
     keys = jax.vmap(lambda k: case_key(seed, k))(jnp.arange(cases))
-    warm = (
-        (lambda k: np.asarray(temperature(k), float)) if temperature else (lambda k: np.zeros(()))
-    )
+    cooled = (lambda k: 0.0) if temperature is None else temperature
+    warm = lambda k: np.asarray(cooled(k), float)
 
     def loss(raw: Any, keys: Array, heat: Array) -> tuple[Array, dict[str, Array]]:
         own = values(raw)
@@ -97,7 +96,7 @@ def tune(
         with jax.numpy_dtype_promotion("standard"):  # Optax adds floats to integers
             update, state = optimizer.update(slope, state, raw)
             moved = optax.apply_updates(raw, update)
-            norm = optax.global_norm(slope)
+            norm = optax.tree.norm(slope)
         return value, norm, terms, slope, moved, state
 
     with jax.numpy_dtype_promotion("standard"):
