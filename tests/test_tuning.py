@@ -118,7 +118,7 @@ def objective(price):
     return of
 
 
-def off_exact(price, scale=jnp.log):
+def off_exact(price):
     """By how much stored gains miss the command of the exact ones, where these fly, and what they
     cost."""
     states = tuning.Flown(START, lambda mission, flight: flight.x[:-1], "samples", 16)
@@ -129,7 +129,20 @@ def off_exact(price, scale=jnp.log):
         x = states(loop(Exact(), jnp.full(20, 1 / 20)), keys)
         dx = x - jax.vmap(nominal)(times)[None]
         off = jnp.einsum("kn,bkn->bk", jax.vmap(gain)(times) - jax.vmap(Exact())(times), dx)
-        return scale(jnp.mean(off**2)) + price * count, {"count": count}
+        return jnp.log(jnp.mean(off**2)) + price * count, {"count": count}
+
+    return of
+
+
+def off_in_the_mean(price):
+    """By how much a series misses the gain of the position, squared, relative and averaged."""
+    tau, w = (jnp.asarray(a) for a in nodes_lg(24))
+    exact = jax.vmap(Exact())(END * (tau + 1) / 2)[:, 0]
+
+    def of(built, keys):
+        gain, count = built
+        off = jax.vmap(gain)(END * (tau + 1) / 2)[:, 0] - exact
+        return w @ off**2 / (w @ exact**2) + price * count, {"count": count}
 
     return of
 
@@ -145,7 +158,7 @@ def samples(design, temperature=None):
 
 def modes(design, temperature):
     share = tuning.cutoff(design["count"], 12, temperature)
-    return Series(share), jnp.sum(share)
+    return Series(share), tuning.priced(share)
 
 
 PLACES = jnp.linspace(0.0, END, 7)
@@ -153,7 +166,7 @@ PLACES = jnp.linspace(0.0, END, 7)
 
 def stations(design, temperature):
     present = jnp.pad(tuning.occupancy(design["there"], temperature), 1, constant_values=1.0)
-    return Table(PLACES, present), jnp.sum(present)
+    return Table(PLACES, present), tuning.priced(present)
 
 
 def test_sample_count_against_all_integers():
@@ -175,7 +188,7 @@ def test_sample_count_against_all_integers():
 
 
 def test_mode_count_against_all_integers():
-    of, steps = off_exact(1.5, lambda v: v), 60
+    of, steps = off_in_the_mean(0.02), 60
     heat = tuning.cooling(1.0, 0.05, steps)
     start = {"count": tuning.Bounded(11.0, 1.0, 13.0)}
     tuned = tuning.tune(of, start, modes, optax.adam(0.1), steps=steps, cases=32, temperature=heat)
@@ -267,8 +280,8 @@ def test_risk():
     assert float(tuning.quantile(v, 0.9)) == pytest.approx(np.quantile(v, 0.9), rel=1e-14)
     assert float(tuning.above(3.0, 2.0)) == 0.25 and float(tuning.above(1.0, 2.0)) == 0
     for f in (tuning.cvar, tuning.quantile, tuning.smooth_quantile):
-        with pytest.raises(ValueError, match="level is 99; give a fraction"):
-            f(v, 99)
+        with pytest.raises(ValueError, match="level is 99.0; give a fraction"):
+            f(v, 99.0)
     # Of many samples of 1,000, some 95 % have the true quantile between their bounds.
     rng = np.random.default_rng(1)
     inside = 0
@@ -281,12 +294,11 @@ def test_risk():
 # Flights ------------------------------------------------------------------------------------------
 
 
-def test_lengths_of_samples(double_integrator):
+def test_lengths_of_samples():
     """Even lengths are the interval; their derivative is that of what they are; zeros are none."""
-    gains = jg.gain_schedule(double_integrator, np.arange(8) / 8)
-    law = jg.NeighboringOptimal(gains)
-    start = jnp.array([0.05, -0.02])
-    make = lambda interval: jg.Mission(DoubleIntegrator(), law, start, interval)
+    make = lambda interval: jg.Mission(
+        DoubleIntegrator(k=1.1), Gained(Exact()), jnp.array([0.05, -0.02]), interval
+    )
     end = eqx.filter_jit(lambda lengths: jg.simulate(make(lengths), None, "ends").final_state)
     even = jnp.full(8, 1 / 8)
     whole = jg.simulate(make(1 / 8), None, "ends").final_state
@@ -294,7 +306,7 @@ def test_lengths_of_samples(double_integrator):
     padded = jnp.concatenate([jnp.zeros(3), even])
     np.testing.assert_allclose(end(padded), whole, atol=1e-13)
     uneven = jnp.array([0.2, 0.1, 0.15, 0.05, 0.15, 0.1, 0.15, 0.1])
-    check_grads(end, (uneven,), order=1, modes=["rev"], rtol=1e-6)
+    check_grads(lambda d: end(d / jnp.sum(d)), (uneven,), order=1, modes=["rev"], rtol=1e-6)
     for lengths, words in (
         ([0.5, 0.6], "adds up to 1.1, but the horizon is 1.0"),
         ([1.5, -0.5], r"sample_interval\[1\] is -0.5"),
@@ -356,17 +368,22 @@ def directional(ready, design, cases, temperature=None, h=1e-5):
     return out
 
 
-@pytest.mark.parametrize("name", ["earth-mars", "earth-mars-history"])
-def test_gradient_of_earth_mars(name, earth_mars):
-    ready = problems.design(name, bound=1e-5, extremal=earth_mars)
-    # Between integers, above the bound, no case near its cap's kink by more than the step.
-    own = {"samples": tuning.Bounded(30.4, 2.0), "places": jnp.linspace(0.1, -0.1, 12)}
-    for leaf, (ours, theirs) in directional(ready, own, 16).items():
+@pytest.mark.parametrize(
+    ("name", "bound"),
+    [("earth-mars", 4e-5), pytest.param("earth-mars-history", 8e-6, marks=pytest.mark.slow)],
+)
+def test_gradient_of_earth_mars(name, bound, earth_mars):
+    ready = problems.design(name, bound=bound, extremal=earth_mars)
+    # Between integers, where a sample enters with a kink, and near the paper's own design: with few
+    # samples badly placed the percentile changes by its own size within a thousandth. Gains close
+    # to the end are good to 1e-10, so that the step is larger: a third root of that, and less.
+    own = {"samples": tuning.Bounded(120.4, 2.0), "places": jnp.linspace(0.05, -0.05, 12)}
+    for leaf, (ours, theirs) in directional(ready, own, 16, h=1e-4).items():
         assert ours == pytest.approx(theirs, rel=1e-5), leaf
 
 
 def test_moon_lander_breaks_find_the_switch():
-    ready = problems.design("moon-lander", steps=120)
+    ready = problems.design("moon-lander")
     own = {"breaks": tuning.Ascending([0.0, 0.28, 0.55, 0.8, 1.0])}
     for leaf, (ours, theirs) in directional(ready, own, 1).items():
         assert ours == pytest.approx(theirs, rel=1e-5), leaf
@@ -375,7 +392,7 @@ def test_moon_lander_breaks_find_the_switch():
     at, end = moon_lander.switch()
     assert end == pytest.approx(4.16414083415688, abs=1e-12)
     rows = confirmed.rows
-    assert rows["mesh error"][1] < 1e-5 * rows["mesh error"][0]
+    assert rows["mesh error"][1] < 1e-6 * rows["mesh error"][0]
     assert rows["nearest break to the switch, off by"][1] < 1e-3
     assert rows["objective, relative error"][1] < 1e-2 * rows["objective, relative error"][0]
 
@@ -478,7 +495,6 @@ def test_what_is_not_finite_stops():
         ({"a": 1.0, "b": {"c": 1.0}}, {}, "does not depend on 'b.c'"),
         ({"a": 1.0}, {"cases": 0}, "cases is 0; give an integer of at least 1"),
         ({"a": 1.0}, {"steps": 0}, "steps is 0"),
-        ({"a": 1.0}, {"steps": 1.5}, "steps is 1.5"),
         ({"a": 1.0}, {"tolerance": -1.0}, "tolerance is -1.0"),
         ({"a": 1.0}, {"optimizer": "adam"}, "optimizer is 'adam'; give an Optax"),
         ({"a": jnp.ones(2)}, {}, r"returned shape \(2,\); give a scalar"),

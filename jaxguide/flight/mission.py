@@ -26,7 +26,8 @@ class Mission(eqx.Module):
     - `law`: measurement -> command over the next sample.
     - `initial_state` (n,), `sample_interval`: samples at min(t0 + k interval, tf). Or a vector (K,)
       of the lengths of K samples, one after another, which add up to the horizon; a sample of no
-      length is none. Not for a law that decides the end.
+      length is none (derivatives: along lengths that keep adding up). Not for a law that decides
+      the end.
     - `hold`: what of the command is flown until the next sample (default: zero-order hold of the
       deviation). `last`: the hold of the sample that ends the flight (default: the same).
     - `sensor(key, t, x)`: the measurement (default: the state).

@@ -19,6 +19,7 @@ from jaxguide.tuning.record import load_history as load_history
 from jaxguide.tuning.relaxation import cooling as cooling
 from jaxguide.tuning.relaxation import cutoff as cutoff
 from jaxguide.tuning.relaxation import occupancy as occupancy
+from jaxguide.tuning.relaxation import priced as priced
 from jaxguide.tuning.relaxation import sample_lengths as sample_lengths
 from jaxguide.tuning.relaxation import thinned_weights as thinned_weights
 from jaxguide.tuning.risk import above as above

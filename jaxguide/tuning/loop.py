@@ -60,8 +60,8 @@ def tune(
     **Returns:** a `Tuned`, with the best design seen.
 
     **Raises:** `ValueError` for a design with a leaf that is no floating array, is not finite, or
-    on which the objective does not depend; for an objective that is no scalar, or is not finite at the
-    start, naming the leaf. If it stops being finite later the run ends there, with a warning.
+    on which the objective does not depend; for an objective that is no scalar, or is not finite at
+    the start, naming the leaf. If it stops being finite later the run ends there, with a warning.
     """
     for name, value in (("steps", steps), ("cases", cases)):
         if not isinstance(value, (int, np.integer)) or value < 1:
@@ -152,7 +152,9 @@ def tune(
     if best is None:
         raise ValueError(f"tune: {message}")
     if stopped == "not finite":
-        warnings.warn(f"tune: {message} The best design before is returned.", stacklevel=2)
+        warnings.warn(
+            f"tune: {message} The best design before is returned.", RuntimeWarning, stacklevel=2
+        )
     return Tuned(
         design=best[3],
         raw=best[2],

@@ -32,6 +32,6 @@ def mesh_error(extremal: Extremal) -> Float[Array, ""]:
     slope = to_gauss @ differentiation_matrix(nodes)
     rate = between(slope, extremal.by_segment(extremal.x)) / half[:, None, None]
     f = jax.vmap(jax.vmap(problem.dynamics))(times, x, u)
-    span = jax.lax.stop_gradient(jnp.max(extremal.x, axis=0) - jnp.min(extremal.x, axis=0))
+    span = jnp.max(extremal.x, axis=0) - jnp.min(extremal.x, axis=0)
     off = (rate - f) / jnp.where(span > 0, span, 1.0)[None, None]
     return jnp.sum(half[:, None] * weights[None] * jnp.sum(off**2, axis=2))

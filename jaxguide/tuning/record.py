@@ -1,4 +1,4 @@
-"""What a tuning run leaves: the design found and how it got there, in a file if wanted. Host only."""
+"""What a tuning run leaves: the design found and how it got there. Host only."""
 
 import os
 from pathlib import Path

@@ -62,6 +62,17 @@ def cutoff(count: Any, size: int, temperature: Any) -> Float[Array, " size"]:
     return jax.nn.sigmoid((count - k - 0.5) / temperature)
 
 
+def priced(share: Float[Array, " thing"]) -> Float[Array, ""]:
+    """The number of things that are there in part, as an objective should pay for them: the sum of
+    1 - (1 - share)^2, a half costing three quarters.
+
+    What is left of a squared error falls as (1 - share)^2 as its term comes in, faster than the
+    share, so that paid by the share alone a thing is best kept in part, however cold. Paid so, the
+    sum is linear in (1 - share)^2, and best at an end.
+    """
+    return jnp.sum(1 - (1 - share) ** 2)
+
+
 def occupancy(logits: Float[Array, " node"], temperature: Any) -> Float[Array, " node"]:
     """How far each node is there, from 0 to 1; cooled, it is or is not."""
     return jax.nn.sigmoid(logits / temperature)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxguide.montecarlo.statistics import normal_quantile
 
 
-def quantile(values: Float[Array, " case"], level: float) -> Float[Array, ""]:
+def quantile(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Array, ""]:
     """The `level` quantile, linear between order statistics.
 
     Its derivative is that of the two cases beside it: exact, and as noisy as that sounds; see
@@ -21,10 +21,10 @@ def quantile(values: Float[Array, " case"], level: float) -> Float[Array, ""]:
     **Raises:** `ValueError` for a level outside (0, 1).
     """
     _check(level, "quantile")
-    return jnp.quantile(values, level)
+    return jnp.quantile(jnp.asarray(values), level)
 
 
-def smooth_quantile(values: Float[Array, " case"], level: float) -> Float[Array, ""]:
+def smooth_quantile(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Array, ""]:
     """Harrell and Davis's estimate of a quantile: a mean of all order statistics with the weights
     of a beta distribution about `level`. Less scatter than `quantile`, and a derivative from many
     cases; biased outwards where the tail is long and cases are few.
@@ -34,8 +34,8 @@ def smooth_quantile(values: Float[Array, " case"], level: float) -> Float[Array,
     **Source:** Harrell & Davis, Biometrika 69 (1982).
     """
     _check(level, "smooth_quantile")
-    weights = jnp.asarray(_harrell_davis(values.shape[0], level), values.dtype)
-    return jnp.sum(weights * jnp.sort(values))
+    weights = _harrell_davis(values.shape[0], level)
+    return jnp.sum(jnp.asarray(weights, values.dtype) * jnp.sort(values))
 
 
 @functools.cache
@@ -44,7 +44,7 @@ def _harrell_davis(count: int, level: float) -> np.ndarray:
     return np.diff(scipy.special.betainc(a, b, np.arange(count + 1) / count))
 
 
-def cvar(values: Float[Array, " case"], level: float) -> Float[Array, ""]:
+def cvar(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Array, ""]:
     r"""Mean of the worst 1 - `level` of the cases: $\min_a a + E[(v - a)^+]/(1 - level)$.
 
     The least is at the quantile, so that its derivative (Danskin's theorem) leaves `a` where it is;
@@ -55,7 +55,7 @@ def cvar(values: Float[Array, " case"], level: float) -> Float[Array, ""]:
     **Source:** Rockafellar & Uryasev, Journal of Risk 2 (2000), eq. (9).
     """
     _check(level, "cvar")
-    count = values.shape[0]
+    values, count = jnp.asarray(values), values.shape[0]
     # The order statistic below which `level` of the cases lie: a minimiser, whichever is taken.
     rank = min(int(np.ceil(level * count - 1e-9)), count) - 1
     a = jax.lax.stop_gradient(jnp.sort(values)[max(rank, 0)])
