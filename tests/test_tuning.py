@@ -342,43 +342,46 @@ def test_memory_does_not_grow_with_the_cases():
 # Ready designs: gradients -------------------------------------------------------------------------
 
 
-def directional(ready, design, cases, temperature=None, h=1e-5):
-    """Derivative along a fixed direction of every leaf at once, and of each leaf alone: reverse
-    mode and central differences. In float64 h = eps^(1/3), some 1e-5, balances the truncation h^2
-    and the rounding eps/h, both of some 1e-10 of a function of order one."""
+def directional(ready, design, cases, temperature=None, width=1e-4):
+    """Of each leaf, the derivative along a fixed direction: by reverse mode, and by differences.
+
+    Gains are good to some 1e-10 close to the end, so that the percentile of a miss has that much
+    noise: a central difference of step h, at its best (some 1e-5 here) leaves 1e-5 of it, and of
+    the truncation. A polynomial of degree 9 through 33 points of [-width, width], by least squares,
+    leaves a tenth of either.
+    """
     batch = keys(cases)
 
     def loss(raw):
         own = values(raw)
         built = ready.build(own) if temperature is None else ready.build(own, temperature)
-        found = ready.objective(built, batch)
-        return found[0] if isinstance(found, tuple) else found
+        return ready.objective(built, batch)[0]
 
     program = jax.jit(jax.value_and_grad(loss), compiler_options=ready.compiler_options)
     flat, unravel = ravel_pytree(design)
     slope = ravel_pytree(program(design)[1])[0]
+    at = np.cos(np.pi * (np.arange(33) + 0.5) / 33)
     out, begin = {}, 0
     for name, leaf in tuning.designs.named(design).items():
         size = np.size(leaf)
         way = np.zeros(flat.size)
         way[begin : begin + size] = np.random.default_rng(begin).normal(size=size)
         begin += size
-        ends = [program(unravel(flat + s * h * jnp.asarray(way)))[0] for s in (1, -1)]
-        out[name] = float(slope @ way), float(ends[0] - ends[1]) / (2 * h)
+        ends = [float(program(unravel(flat + s * width * jnp.asarray(way)))[0]) for s in at]
+        fit = np.polynomial.Chebyshev.fit(at, ends, 9, domain=[-1, 1])
+        out[name] = float(slope @ way), float(fit.deriv()(0.0)) / width
     return out
 
 
 @pytest.mark.parametrize(
     ("name", "bound"),
-    [("earth-mars", 4e-5), pytest.param("earth-mars-history", 8e-6, marks=pytest.mark.slow)],
+    [("earth-mars", 1e-5), pytest.param("earth-mars-history", 1e-6, marks=pytest.mark.slow)],
 )
 def test_gradient_of_earth_mars(name, bound, earth_mars):
     ready = problems.design(name, bound=bound, extremal=earth_mars)
-    # Between integers, where a sample enters with a kink, and near the paper's own design: with few
-    # samples badly placed the percentile changes by its own size within a thousandth. Gains close
-    # to the end are good to 1e-10, so that the step is larger: a third root of that, and less.
-    own = {"samples": tuning.Bounded(120.4, 2.0), "places": jnp.linspace(0.05, -0.05, 12)}
-    for leaf, (ours, theirs) in directional(ready, own, 16, h=1e-4).items():
+    # Above the bound, and between integers, where a sample enters with a kink.
+    own = {"samples": tuning.Bounded(30.4, 2.0), "places": jnp.linspace(0.1, -0.1, 12)}
+    for leaf, (ours, theirs) in directional(ready, own, 16, width=3e-5).items():
         assert ours == pytest.approx(theirs, rel=1e-5), leaf
 
 
@@ -394,7 +397,8 @@ def test_moon_lander_breaks_find_the_switch():
     rows = confirmed.rows
     assert rows["mesh error"][1] < 1e-6 * rows["mesh error"][0]
     assert rows["nearest break to the switch, off by"][1] < 1e-3
-    assert rows["objective, relative error"][1] < 1e-2 * rows["objective, relative error"][0]
+    # In proportion to the distance that is left, which was some 0.05 of the horizon.
+    assert rows["objective, relative error"][1] < 0.05 * rows["objective, relative error"][0]
 
 
 @pytest.mark.slow
