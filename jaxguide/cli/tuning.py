@@ -1,6 +1,7 @@
 """`jaxguide tune`: a named design, tuned by gradient and confirmed on fresh cases."""
 
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 from rich.text import Text
@@ -49,43 +50,58 @@ def tune(
         library.design(name)  # says which there are
     with waiting(RichProgress(f"design {name}")):
         ready = library.design(name) if steps is None else library.design(name, steps=steps)
-    progress = RichProgress(f"tune {name}", total=ready.steps, unit="steps")
-    tuned = ready.tune(cases=cases, seed=seed, out=folder(out), progress=progress)
+    watch = lambda what, count: RichProgress(f"{what} {name}", total=count, unit="steps")
+    options = {"cases": cases, "seed": seed}
+    tuned = ready.tune(out=folder(out), progress=watch("tune", ready.steps), **options)
+    runs = [(ready, tuned)]
+    if ready.rounded is not None:
+        with waiting(RichProgress("round")):
+            whole = ready.rounded(tuned)
+        count = whole.steps if steps is None else min(steps, whole.steps)
+        beside = None if out is None else out / "rounded"
+        last = whole.tune(count, out=beside, progress=watch("tune rounded", count), **options)
+        runs.append((whole, last))
     with waiting(RichProgress("confirm")):
-        confirmed = ready.confirm(tuned, fresh, seed + 1)
+        confirmed = runs[-1][0].confirm(runs[-1][1], fresh, seed + 1)
     figures = []
     if out is not None:
         from jaxguide.plotting import plot_tuning
 
-        figures = [save(plot_tuning(tuned, ready.places), out, f"{name}-tuning")]
+        for (made, run), word in zip(runs, ("tuning", "rounded"), strict=False):
+            figures.append(save(plot_tuning(run, made.places), out, f"{name}-{word}"))
     data = {
         "design": name,
         "about": ready.about,
-        "steps": len(tuned.history["loss"]),
         "cases": ready.cases if cases is None else cases,
         "seed": seed,
         "fresh": fresh,
-        "loss": tuned.loss,
-        "start": tuned.start,
-        "tuned": tuned.design,
-        "stopped": tuned.stopped,
-        "message": tuned.message,
-        "history": tuned.history,
-        "compile_s": tuned.compile_s,
-        "step_s": tuned.step_s,
+        "runs": [_told(run) for _, run in runs],
         "confirmed": {key: list(pair) for key, pair in confirmed.rows.items()},
         "beside": {str(n): value for n, value in confirmed.beside.items()},
         "notes": list(confirmed.notes),
         "better": confirmed.better,
         "figures": figures,
     }
-    head = (
-        f"{ready.about}\nloss {float(tuned.history['loss'][0]):.6g} to {tuned.loss:.6g} at step "
-        f"{tuned.at}; {tuned.message} {tuned.step_s:.2g} s a step, {tuned.compile_s:.0f} s to "
-        "compile"
-    )
+    head = [f"{made.about}\n  {_in_words(run)}" for made, run in runs]
     table = Table("", "start", "tuned", box=None)
     for key, (before, after) in confirmed.rows.items():
         table.add_row(key, f"{before:.6g}", f"{after:.6g}")
-    shown = [Text(head), table, *(Text(note) for note in confirmed.notes), *written(figures)]
-    return Outcome(data, shown, confirmed.better)
+    notes = [Text(text) for text in (*head, *confirmed.notes)]
+    return Outcome(
+        data, [*notes[: len(head)], table, *notes[len(head) :], *written(figures)], confirmed.better
+    )
+
+
+def _told(run: Any) -> dict[str, Any]:
+    names = ("loss", "at", "start", "design", "stopped", "message", "compile_s", "step_s")
+    return {name: getattr(run, name) for name in names} | {
+        "steps": len(run.history["loss"]),
+        "history": run.history,
+    }
+
+
+def _in_words(run: Any) -> str:
+    return (
+        f"loss {float(run.history['loss'][0]):.6g} to {run.loss:.6g} at step {run.at}; "
+        f"{run.message} {run.step_s:.2g} s a step, {run.compile_s:.0f} s to compile"
+    )
