@@ -5,6 +5,7 @@
 # pyright: reportOptionalCall=false
 
 import itertools
+import math
 
 import equinox as eqx
 import jax
@@ -347,10 +348,10 @@ def test_memory_does_not_grow_with_the_cases():
 def directional(ready, design, cases, temperature=None, width=1e-3):
     """Of each leaf, the derivative along a fixed direction: by reverse mode, and by differences.
 
-    Gains are good to some 1e-10 close to the end, so that the percentile of a miss has that much
-    noise: a central difference of step h, at its best (some 1e-5 here) leaves 1e-5 of it, and of
-    the truncation. A polynomial of degree 9 through 33 points of [-width, width], by least squares,
-    leaves a tenth of either.
+    Gains are good to some 1e-10 close to the end, so that a percentile of the miss has noise of up
+    to 1e-8 of its size, and within 1e-3 it may change by as much as itself: a central difference,
+    at its best step of 1e-5, is good to 1e-5 or so. A polynomial of degree 9 through 33 points of
+    [-width, width], by least squares, is good to 1e-7 where no two cases change places there.
     """
     batch = keys(cases)
 
@@ -376,14 +377,18 @@ def directional(ready, design, cases, temperature=None, width=1e-3):
 
 
 @pytest.mark.parametrize(
-    ("name", "bound"),
-    [("earth-mars", 1e-5), pytest.param("earth-mars-history", 1e-6, marks=pytest.mark.slow)],
+    ("name", "bound", "samples", "width"),
+    [
+        ("earth-mars", 1e-5, 20.4, 3e-4),
+        pytest.param("earth-mars-history", 1e-6, 9.4, 1e-2, marks=pytest.mark.slow),
+    ],
 )
-def test_gradient_of_earth_mars(name, bound, earth_mars):
-    ready = problems.design(name, bound=bound, extremal=earth_mars)
+def test_gradient_of_earth_mars(name, bound, samples, width, earth_mars):
+    options = {"samples": samples, "most": math.ceil(samples) + 1}
+    ready = problems.design(name, bound=bound, extremal=earth_mars, **options)
     # Above the bound, and between integers, where a sample enters with a kink.
-    own = {"samples": tuning.Bounded(30.4, 2.0), "places": jnp.linspace(0.1, -0.1, 12)}
-    for leaf, (ours, theirs) in directional(ready, own, 16, width=1e-3).items():
+    own = ready.design | {"places": jnp.linspace(0.1, -0.1, 12)}
+    for leaf, (ours, theirs) in directional(ready, own, 16, width=width).items():
         assert ours == pytest.approx(theirs, rel=1e-5), leaf
 
 

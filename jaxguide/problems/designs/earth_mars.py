@@ -41,6 +41,7 @@ def design(
     bound: float | None = None,
     extremal: Extremal | None = None,
     samples: float = MOST,
+    most: int = MOST,
     steps: int = 300,
 ) -> Ready:
     """Neighbouring optimal control on the paper's transfer: how many samples, and where.
@@ -52,7 +53,7 @@ def design(
 
     **Arguments:** `hold`: of the deviation between samples: "deviation" (zero-order) or "history"
     (eq. 49); `bound`: of the percentile; default `MARGIN` of the paper's interval's with the same
-    hold. `samples`: to start from, evenly.
+    hold. `samples`: to start from, evenly; `most`: that there may be.
     """
     if hold not in HOLDS:
         raise ValueError(f"design: hold is {hold!r}; choose one of {', '.join(HOLDS)}.")
@@ -61,7 +62,7 @@ def design(
     if bound is None:
         bound = MARGIN * float(jnp.quantile(loop.misses(loop.paper(), _keys(1, 20_000)), LEVEL))
     objective = functools.partial(_objective, bound)
-    build = functools.partial(_build, loop, MOST)
+    build = functools.partial(_build, loop, most)
     name = "earth-mars" if hold == "deviation" else f"earth-mars-{hold}"
     # One step changes the number by some per cent at most, and the density likewise.
     rate = optax.cosine_decay_schedule(0.02, steps)
@@ -77,7 +78,7 @@ def design(
         confirm=functools.partial(_confirm, loop),
         places=_places,
     )
-    return ready._replace(rounded=functools.partial(_rounded, loop, ready))
+    return ready._replace(rounded=functools.partial(_rounded, loop, ready, most))
 
 
 def _objective(
@@ -94,12 +95,12 @@ def _build(loop: "_Loop", most: int, own: dict[str, Array]) -> tuple[Mission, Ar
     return loop.mission(own["samples"], own["places"], most), own["samples"]
 
 
-def _rounded(loop: "_Loop", ready: Ready, tuned: Tuned) -> Ready:
+def _rounded(loop: "_Loop", ready: Ready, most: int, tuned: Tuned) -> Ready:
     """The best of the integers beside the number found, and their places tuned on: between two
     integers the samples lie elsewhere than at either."""
     own, keys = tuned.design, _keys(0, ready.cases)
     at = eqx.filter_jit(lambda n: ready.objective(ready.build(own | {"samples": n}), keys)[0])
-    found = counted(lambda n: at(jnp.asarray(float(n))), own["samples"], tuned.loss, 2, MOST)
+    found = counted(lambda n: at(jnp.asarray(float(n))), own["samples"], tuned.loss, 2, most)
     count = jnp.asarray(float(found.count))
 
     def build(places: dict[str, Array]) -> tuple[Mission, Array]:
@@ -136,7 +137,7 @@ def _places(own: dict[str, Any]) -> dict[str, np.ndarray]:
 
 def history(**options: Any) -> Ready:
     """As `design`, the law's own open-loop control flown between samples."""
-    return design("history", **{"samples": 60.0, "steps": 200, **options})
+    return design("history", **{"samples": 60.0, "most": 60, "steps": 200, **options})
 
 
 def schedule(extremal: Extremal) -> GainSchedule:
