@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jaxguide import problems as problems
+    from jaxguide import tuning as tuning
     from jaxguide.batch import solve_batch as solve_batch
     from jaxguide.bellman import Bellman as Bellman
     from jaxguide.bellman import bellman as bellman
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
     from jaxguide.trajectory import Extremal as Extremal
     from jaxguide.trajectory import Trajectory as Trajectory
     from jaxguide.trig import sincos as sincos
+    from jaxguide.tuning.loop import tune as tune
     from jaxguide.types import RESULTS as RESULTS
     from jaxguide.types import SolveError as SolveError
 
@@ -123,8 +125,9 @@ _HOME = {
     "solve_batch": "batch",
     "suboptimal_gains": "neighboring.suboptimal",
     "sweep": "montecarlo.sweep",
+    "tune": "tuning.loop",
 }
-_MODULES = ("export", "plotting", "problems", "report", "reproduce")
+_MODULES = ("export", "plotting", "problems", "report", "reproduce", "tuning")
 
 
 def __getattr__(name: str) -> object:

@@ -148,6 +148,35 @@ def test_figures(command, tmp_path, capfd):
     assert [str(p) for p in out.iterdir()] == [figure]
 
 
+@pytest.mark.parametrize("better", [True, False])
+def test_tune(monkeypatch, tmp_path, capfd, better):
+    """Relaxed, rounded, confirmed: both runs told, saved and drawn."""
+    from jaxguide.tuning import Confirmed, Ready, load_history
+
+    rows, places = {"gain evaluations": (166.0, 62.0)}, lambda own: {"places": own["a"]}
+    ready = Ready(
+        name="bowl", about="a bowl", objective=lambda own, keys: jnp.sum((own["a"] - 0.5) ** 2),
+        design={"a": jnp.array([0.1, 0.9])}, build=lambda own: own, optimizer=None, steps=4,
+        cases=2,
+        confirm=lambda run, cases, seed: Confirmed(rows, {62: cases + seed}, ("a note",), better),
+        places=places,
+    )  # fmt: skip
+    whole = ready._replace(rounded=lambda run: ready)
+    monkeypatch.setattr(problems, "designs", lambda: ("bowl",))
+    monkeypatch.setattr(problems, "design", lambda name, steps=4: whole._replace(steps=steps))
+    monkeypatch.setattr(plotting, "plot_tuning", lambda *a: Figure())
+    line = ["tune", "bowl", "--steps", "3", "--seed", "1", "--fresh", "9", "--out", str(tmp_path)]
+    assert cli.run([*line, "--json"]) == 1 - better
+    data = json.loads(capfd.readouterr().out)
+    assert [run["steps"] for run in data["runs"]] == [3, 3] and data["beside"] == {"62": 11}
+    assert len(load_history(tmp_path)["loss"]) == len(load_history(tmp_path / "rounded")["loss"])
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["bowl-rounded.png", "bowl-tuning.png"]
+    cli.run(line)
+    assert "166" in capfd.readouterr().out
+    assert cli.run(["tune", "bowl", "--fresh", "0"]) == 1
+    assert "--fresh must be at least 1, got 0" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("computed", [1.0, 1.1])
 def test_reproduction_out_of_tolerance_exits_with_1(monkeypatch, capfd, computed):
     reproduction(monkeypatch, computed)

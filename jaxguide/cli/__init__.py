@@ -15,12 +15,13 @@ from typing import Any
 from cyclopts import CycloptsError
 from rich.console import Console
 
-from jaxguide.cli import checking, reporting, solving, sweeping
+from jaxguide.cli import checking, reporting, solving, sweeping, tuning
 from jaxguide.cli.app import Common, app
 
 COMMANDS = (
     *(solving.problems, solving.reproduce, solving.solve, solving.gains, solving.fly),
     *(sweeping.sweep, sweeping.rerun, reporting.report, reporting.export, reporting.compare),
+    tuning.tune,
     checking.doctor,
 )
 

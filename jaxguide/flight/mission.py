@@ -24,7 +24,10 @@ class Mission(eqx.Module):
 
     - `plant`: a Problem; only its dynamics are used. It may differ from the law's own model.
     - `law`: measurement -> command over the next sample.
-    - `initial_state` (n,), `sample_interval`: samples at min(t0 + k interval, tf).
+    - `initial_state` (n,), `sample_interval`: samples at min(t0 + k interval, tf). Or a vector (K,)
+      of the lengths of K samples, one after another, which add up to the horizon; a sample of no
+      length is none (derivatives: along lengths that keep adding up). Not for a law that decides
+      the end.
     - `hold`: what of the command is flown until the next sample (default: zero-order hold of the
       deviation). `last`: the hold of the sample that ends the flight (default: the same).
     - `sensor(key, t, x)`: the measurement (default: the state).
@@ -112,8 +115,10 @@ class Mission(eqx.Module):
         self.final_time = jnp.asarray(final_time, dtype)
         self.miss = None if miss is None else jnp.asarray(miss, dtype)
         self.integrator = RungeKutta4() if integrator is None else integrator
+        if self.sample_interval.ndim:
+            max_samples = _one_length_each(self, max_samples)
         traced = is_traced((self.sample_interval, self.initial_time, self.final_time))
-        if not traced:
+        if not traced and not self.sample_interval.ndim:
             count = _sample_count(
                 float(np.asarray(sample_interval)),
                 float(np.asarray(initial_time)),
@@ -147,6 +152,34 @@ _LAST_STEPS = 8  # shorter and shorter ones, in which a law that decides the end
 
 def _latest(law: Any, initial_time: Any) -> Any:
     return initial_time + 1.5 * law.schedule.duration
+
+
+def _one_length_each(mission: Mission, max_samples: int | None) -> int:
+    lengths = mission.sample_interval
+    if lengths.ndim != 1 or not lengths.size or max_samples not in (None, lengths.size):
+        raise ValueError(
+            f"Mission: sample_interval has shape {lengths.shape} and max_samples is {max_samples}; "
+            "give one number, or a vector of the lengths of all samples and no max_samples."
+        )
+    if mission.law.decides_end:
+        raise ValueError(
+            f"Mission: {type(mission.law).__name__} decides the end of its flight, so the lengths "
+            "of its samples cannot be given ahead; give one sample_interval."
+        )
+    if not is_traced((lengths, mission.initial_time, mission.final_time)):
+        host, span = np.asarray(lengths), float(mission.final_time - mission.initial_time)
+        if not np.all(np.isfinite(host)) or np.any(host < 0):
+            k = int(np.argmax(~np.isfinite(host) | (host < 0)))
+            raise ValueError(
+                f"Mission: sample_interval[{k}] is {host[k]}; give finite lengths, none below 0."
+            )
+        slack = 4 * lengths.size * float(jnp.finfo(lengths.dtype).eps)
+        if abs(host.sum() - span) > slack * abs(span):
+            raise ValueError(
+                f"Mission: sample_interval adds up to {host.sum()}, but the horizon is {span} "
+                "long; scale the lengths to it."
+            )
+    return lengths.size
 
 
 def _sample_count(interval: float, t0: float, tf: float) -> int:

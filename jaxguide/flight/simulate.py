@@ -75,7 +75,7 @@ def simulate(
 
     **Error:** fixed steps: fourth order in sample_interval / steps; Adaptive: its tolerance.
     Differentiable in every leaf of the mission, the sample interval included (between the values
-    at which the number of samples jumps).
+    at which the number of samples jumps), and the lengths of samples given one by one.
     """
     if save not in ("samples", "ends"):
         raise ValueError(f"save is {save!r}; choose 'samples' or 'ends'.")
@@ -208,9 +208,14 @@ def _arrived(mission: Mission, x0: Array, xf: Array, tf: Array) -> Bool[Array, "
 
 
 def sample_times(mission: Mission) -> Float[Array, " instant"]:
-    """min(t0 + k interval, tf) for k = 0 ... max_samples; the last is tf."""
-    count = jnp.arange(mission.max_samples + 1).astype(mission.initial_state.dtype)
-    times = mission.initial_time + mission.sample_interval * count
+    """min(t0 + k interval, tf) for k = 0 ... max_samples, or after each given length; the last is
+    tf."""
+    if mission.sample_interval.ndim:
+        passed = jnp.pad(jnp.cumsum(mission.sample_interval), (1, 0))
+    else:
+        count = jnp.arange(mission.max_samples + 1).astype(mission.initial_state.dtype)
+        passed = mission.sample_interval * count
+    times = mission.initial_time + passed
     return jnp.minimum(times, mission.final_time).at[-1].set(mission.final_time)
 
 

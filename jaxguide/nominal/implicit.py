@@ -1,5 +1,6 @@
-"""Derivatives of a converged direct solution with respect to its Problem, by the implicit function
-theorem on the conditions of the last barrier problem: smooth in every parameter and bound."""
+"""Derivatives of a converged direct solution with respect to its Problem and its mesh, by the
+implicit function theorem on the conditions of the last barrier problem: smooth in every parameter,
+bound and break."""
 
 from typing import Any
 
@@ -17,7 +18,7 @@ _tree = jax.tree_util.tree_map
 
 
 def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Solution:
-    """Change of `solution` per change `tangent` of `program.problem`; transposable.
+    """Change of `solution` per change `tangent` of `program`'s (problem, edges); transposable.
 
     Active bounds are held by their barrier: at its last value mu a bound's curvature is z^2/mu, so
     that it moves by mu/z of what a free one would. Where z is itself of the order of sqrt(mu) (a
@@ -27,8 +28,8 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
     w, y, mu = solution.w, solution.y, solution.mu
     given = boxed(bounds(program)).given
 
-    def conditions(problem: Any) -> tuple[newton.Load, Primal, tuple[Primal, Primal]]:
-        here = eqx.tree_at(lambda p: p.problem, program, problem)
+    def conditions(stated: Any) -> tuple[newton.Load, Primal, tuple[Primal, Primal]]:
+        here = eqx.tree_at(lambda p: (p.problem, p.edges), program, stated)
         box = boxed(bounds(here))
         at = _tree(lambda w, g, lo: jnp.where(g, lo, w), w, given, box.lo)
         low, high = distances(box, at)
@@ -41,7 +42,7 @@ def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Sol
         fixed = _tree(lambda g, lo: jnp.where(g, lo, 0.0), given, box.lo)
         return newton.Load(force, c), fixed, (low, high)
 
-    out, moved = eqx.filter_jvp(conditions, (program.problem,), (tangent,))
+    out, moved = eqx.filter_jvp(conditions, ((program.problem, program.edges),), (tangent,))
     fill = lambda t, o: jnp.zeros_like(o) if t is None else t
     moved = _tree(fill, moved, out, is_leaf=lambda t: t is None)
     (_, _, (low, high)), (load, d_given, (d_low, d_high)) = out, moved

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxguide.linalg import single_threaded_lapack
 from jaxguide.nominal import interior_point
@@ -69,7 +70,8 @@ class Pseudospectral(eqx.Module):
     - `quick`: compile in half the time, for programs a fifth slower. False where one mesh is solved
       on many times. Under a trace whoever compiles decides.
 
-    **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells.
+    **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells. Derivatives
+    by parameters and by `fractions` are implicit, of the discrete solution.
 
     **Source:** review, eqs (10)-(16), (21), (23); Waechter & Biegler (2006).
     """
@@ -239,8 +241,10 @@ class Pseudospectral(eqx.Module):
                 start, warm = start._replace(**duals(program, fractions, w, guess)), True
                 mu, push = 1e-6, 1e-6
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
-        out = jax.lax.stop_gradient((program, start))
-        return *out, jax.tree_util.tree_map(jnp.asarray, options)
+        # Where the search starts does not matter to the solution; where the breaks are, does.
+        still, start = jax.lax.stop_gradient((program, start))
+        program = eqx.tree_at(lambda p: p.edges, still, program.edges)
+        return program, start, jax.tree_util.tree_map(jnp.asarray, options)
 
 
 def finished(
@@ -253,8 +257,8 @@ def finished(
     """What the optimiser makes of `Pseudospectral.prepared`: one program for every guess, break
     and scale."""
     whole = rewrapped(program.problem, problem)
-    solution = _solved(whole, program, start, options)
-    program = eqx.tree_at(lambda p: p.problem, program, whole)
+    solution = _solved((whole, program.edges), program, start, options)
+    program = _stated(program, (whole, program.edges))
     return to_extremal(problem, program, bounds(program), solution, certifier)
 
 
@@ -276,22 +280,26 @@ def _one_at_a_time(
     return interior_point.minimise(program, box, start, options)
 
 
+def _stated(program: Transcription, given: tuple[Problem, Array]) -> Transcription:
+    """`program` of another problem, on other breaks."""
+    return eqx.tree_at(lambda p: (p.problem, p.edges), program, given)
+
+
 @eqx.filter_custom_jvp
 def _solved(
-    problem: Problem,
+    given: tuple[Problem, Array],
     program: Transcription,
     start: interior_point.Start,
     options: interior_point.Options,
 ) -> interior_point.Solution:
-    """The solution for `problem` in the units and on the mesh of `program`."""
-    program = eqx.tree_at(lambda p: p.problem, program, problem)
+    """The solution for `given`, a problem and the breaks of the mesh, in the units of `program`."""
+    program = _stated(program, given)
     return _one_at_a_time(program, bounds(program), start, options)
 
 
 @_solved.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
     """The implicit function theorem on the conditions that the optimiser met, never its steps."""
-    problem, program, start, options = primals
-    solution = _solved(problem, program, start, options)
-    program = eqx.tree_at(lambda p: p.problem, program, problem)
-    return solution, sensitivity(program, solution, tangents[0])
+    given, program, start, options = primals
+    solution = _solved(given, program, start, options)
+    return solution, sensitivity(_stated(program, given), solution, tangents[0])

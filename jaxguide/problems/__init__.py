@@ -9,6 +9,7 @@ from jaxguide.types import UnknownName
 if TYPE_CHECKING:
     from jaxguide.flight.mission import Mission
     from jaxguide.problem import Problem
+    from jaxguide.tuning.ready import Ready
 
 # name -> (module, Problem class); a module may also offer `mission` and `dispersions`.
 _LIBRARY = {
@@ -46,6 +47,14 @@ _LIBRARY = {
     "npsat1": ("npsat1", "NPSAT1"),
     "lunar-launch": ("lunar_launch", "LunarLaunch"),
     "delta-iii": ("delta_iii", "DeltaIII"),
+}
+
+# name -> (module of jaxguide.problems.designs, function)
+_DESIGNS = {
+    "earth-mars": ("earth_mars", "design"),
+    "earth-mars-history": ("earth_mars", "history"),
+    "lunar-launch": ("lunar_launch", "design"),
+    "moon-lander": ("moon_lander", "design"),
 }
 
 
@@ -86,6 +95,24 @@ def mission(name: str, **options: Any) -> "Mission":
 def dispersions(name: str) -> dict[str, Any]:
     """The dispersions its sweep draws by default."""
     return _offered(name, "dispersions")()
+
+
+def designs() -> tuple[str, ...]:
+    """Names of the designs ready to tune."""
+    return tuple(_DESIGNS)
+
+
+def design(name: str, **options: Any) -> "Ready":
+    """A design ready to tune, as `jaxguide tune` does.
+
+    **Raises:** `UnknownName`, which suggests the nearest name.
+    """
+    if name not in _DESIGNS:
+        raise UnknownName("design", name, _DESIGNS)
+    module, function = _DESIGNS[name]
+    return getattr(importlib.import_module(f"jaxguide.problems.designs.{module}"), function)(
+        **options
+    )
 
 
 def _offered(name: str, what: str) -> Any:

@@ -1,0 +1,1 @@
+"""Designs ready to tune, by name: see `jaxguide.problems.design`."""
