@@ -225,7 +225,7 @@ def structured(
     watch(Progress(f"free knots, complementarity {wrong:.0e}", exact, error))
     # Singular arcs are wrong in other ways.
     held = bool(np.all(found.active[:, : problem.m]))
-    if corrections and held and _SOUND < wrong < np.inf:
+    if corrections and held and _SOUND < wrong <= _WRONG:
         better = corrected(exact, found, ends)
         if len(better.junctions) > len(junctions):
             other, less = again(better, corrections=corrections - 1)
