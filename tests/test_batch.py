@@ -32,7 +32,7 @@ class Meter:
         self.closed = True
 
 
-@pytest.mark.parametrize("count", [64, 256])
+@pytest.mark.parametrize("count", [pytest.param(64, marks=pytest.mark.slow), 256])
 def test_lanes_are_single_solves(count):
     k = jnp.linspace(0.5, 2.0, count)
     meter = Meter()

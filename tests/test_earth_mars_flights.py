@@ -90,6 +90,7 @@ def mean_squared_miss(schedule):
     return miss
 
 
+@pytest.mark.slow
 def test_gradients_of_the_miss_of_200_flights(mean_squared_miss):
     # 3.32 / 0.0203 = 163.5: the number of samples is the same a little to either side.
     design = jnp.array([0.0203, 0.1405, 1.0])

@@ -36,6 +36,7 @@ def test_library_from_a_straight_line(name, left):
     np.testing.assert_allclose(e.objective, problems.reference(name).value, rtol=left)
 
 
+@pytest.mark.slow
 def test_structure_is_found_and_solved_exactly():
     steps = []
     e = jg.solve(problems.get("moon-lander"), jg.Pseudospectral(), watch=steps.append)
@@ -73,6 +74,7 @@ def test_arcs_that_free_knots_closed_are_dropped():
     assert len(without_collapsed(alike, np.array([0.0, 0.55, 0.550001, 1.0])).junctions) == 0
 
 
+@pytest.mark.slow
 def test_random_starts_are_extremals_or_reasons():
     method = jg.Pseudospectral(nodes=5, segments=4, refinements=0)
     problem = problems.get("brachistochrone")
@@ -90,6 +92,7 @@ def test_npsat1_on_one_segment():
     np.testing.assert_allclose(e.objective, 112.2088, atol=5e-5)
 
 
+@pytest.mark.slow
 def test_bellman_segments_do_not_add_up_errors():
     problem = problems.get("brachistochrone")
     method = jg.Pseudospectral("lgl", 7, 1, refinements=0)

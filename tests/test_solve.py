@@ -152,6 +152,7 @@ def test_the_costly_row_flies_the_control(earth_mars):
     assert row["where"] in EarthMars.state_names and row["value"] > 1e-6
 
 
+@pytest.mark.slow
 def test_a_conjugate_point_fails_its_row():
     # x' = u, J = int (u^2 - x^2)/2 on ends given: conjugate pi before the end.
     for horizon in (3.0, 4.0):

@@ -392,6 +392,7 @@ def test_gradient_of_earth_mars(name, bound, samples, width, earth_mars):
         assert ours == pytest.approx(theirs, rel=1e-5), leaf
 
 
+@pytest.mark.slow
 def test_moon_lander_breaks_find_the_switch():
     ready = problems.design("moon-lander")
     own = {"breaks": tuning.Ascending([0.0, 0.28, 0.55, 0.8, 1.0])}

@@ -59,7 +59,7 @@ def about(order: Order) -> dict[str, Any]:
     return {
         "plant": {"class": type(plant).__qualname__, "controls": control, **numbers},
         "law": type(order.mission.law).__qualname__,
-        "sample_interval": float(order.mission.sample_interval),
+        "sample_interval": np.asarray(order.mission.sample_interval).tolist(),
         "dispersions": as_written(order.dispersions)
         or {str(path): repr(value) for path, value in order.dispersions.items()},
         "written": as_written(order.dispersions) is not None,

@@ -93,6 +93,13 @@ def _text(value: Any) -> str:
     return markup.escape(str(value))
 
 
+def _sampling(interval: Any) -> str:
+    if isinstance(interval, list):  # of every sample by itself
+        used = [length for length in interval if length > 0]
+        return f"{len(used)} times, {_number(min(used))} to {_number(max(used))} apart"
+    return f"every {_number(interval)}"
+
+
 def _number(value: Any, digits: int = 6) -> str:
     if value is None:
         return "none"
@@ -146,7 +153,7 @@ def _flown(manifest: dict[str, Any], attrs: dict[str, Any]) -> str:
     rows = [
         ("mission", _text(manifest.get("label") or "not of the library")),
         ("plant", f"{_text(about['plant']['class'])}<br><small>{_text(numbers)}</small>"),
-        ("law", f"{_text(about['law'])}, sampled every {_number(about['sample_interval'])}"),
+        ("law", f"{_text(about['law'])}, sampled {_sampling(about['sample_interval'])}"),
         ("flights", flown),
         ("seed, sampling", f"{manifest['seed']}, {_text(attrs['sampling'].replace('_', ' '))}"),
         ("precision", _text(manifest["dtype"])),
