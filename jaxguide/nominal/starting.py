@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
@@ -25,6 +25,9 @@ from jaxguide.problem import (
     with_parameters,
 )
 from jaxguide.trajectory import Extremal
+
+_REST = 1e-8  # a guess below it rests at zero
+_SHARES = (0.0, -0.25, 0.25)  # of a control's range, from its middle
 
 
 def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
@@ -91,7 +94,7 @@ def straight_guess(
         size = jnp.linalg.norm(J, axis=1)
         size = jnp.where(size > 0, size, 1.0)
         miss, J = (e - jnp.clip(e, e_lo, e_hi)) / size, J / size[:, None]
-        step = J.T @ small_solve(J @ J.T + 1e-8 * jnp.eye(q, dtype=dtype), miss)
+        step = J.T @ small_solve(J @ J.T + 1e-8 * q * jnp.eye(q, dtype=dtype), miss)
         step = jnp.where(jnp.isfinite(step), step, 0.0)
         return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
 
@@ -104,7 +107,43 @@ def straight_guess(
     u = jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
     p = [start_value(v) for v in parameters(program.problem)]
     times = placed(t0, tf, fractions, knots)
-    return without_slacks(program, x0, x, u, times, p)
+    ends_at = lambda xf: problem.endpoint_constraints(x0, xf, t0, tf)
+    unasked = ~jnp.any(jax.jacfwd(ends_at)(xf) != 0, axis=0) if q else jnp.ones(n, bool)
+    rests = unasked & (jnp.abs(x0) < _REST) & (jnp.abs(xf) < _REST)
+    rests = rests & ~jnp.asarray(initially_free(program.problem))
+    return propagated(program, without_slacks(program, x0, x, u, times, p), rests)
+
+
+def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> Primal:
+    """`w` with the states that rest at zero, and are asked nothing at the end, flown along it.
+
+    Where a start is singular at rest (a brachistochrone's, without speed), the middle control may
+    leave them there: of three constant controls the one that fits the other states' rates best.
+    """
+    size, rule, dtype = program.sizes, program.rule, program.dtype
+    lo, hi = bounds_of(program.problem.control_bounds, size.m, dtype)
+    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    x_lo, x_hi = bounds_of(program.problem.state_bounds, size.n, dtype)
+    weights, along = jnp.asarray(rule.w, dtype), jnp.asarray((rule.support[1:] + 1) / 2, dtype)
+
+    def flown(share: Array) -> tuple[Primal, Array]:
+        moved = jnp.where(bounded, share * (hi - lo), 0.0)
+        at = w._replace(u=w.u + jnp.where(bounded, moved, 0.0)[None, None])
+        rates = lambda at: program.values(at)[0][:, :, : size.n]
+        gained = jnp.einsum("k,skn->sn", weights, rates(at))
+        start = w.x0[None] + jnp.cumsum(gained, axis=0) - gained
+        x = start[:, None] + along[None, :, None] * gained[:, None]
+        x = jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), x_lo[None, None], x_hi[None, None])
+        at = at._replace(x=jnp.where(rests[None, None], x, w.x))
+        ends = jnp.concatenate([w.x0[None], at.x[:, -1]])
+        left = jnp.einsum("k,skn->sn", weights, rates(at)) - jnp.diff(ends, axis=0)
+        return at, jnp.sum(jnp.where(rests[None], 0.0, jnp.abs(left)))
+
+    tries, misfit = jax.vmap(flown)(jnp.asarray(_SHARES, dtype))
+    misfit = jnp.where(jnp.isfinite(misfit), misfit, jnp.inf)
+    best = jnp.argmin(misfit * (1 + jnp.abs(jnp.asarray(_SHARES, dtype))))  # the middle if alike
+    chosen = jax.tree_util.tree_map(lambda a: a[best], tries)
+    return jax.tree_util.tree_map(lambda a, b: jnp.where(jnp.any(rests), a, b), chosen, w)
 
 
 def is_key(guess: Any) -> bool:
