@@ -139,7 +139,7 @@ def _own(extremal: Extremal, values: Any) -> np.ndarray:
     values = np.asarray(values)
     flat = values.reshape(values.shape[0], -1)
     own = np.abs(np.asarray(legendre_matrix(extremal.reference_nodes))[0]) > 1e-9
-    by_segment = np.asarray(extremal.by_segment(flat))[:, own]
+    by_segment = np.asarray(extremal.by_segment(jnp.asarray(flat)))[:, own]
     return by_segment.reshape(-1, *values.shape[1:])
 
 

@@ -91,19 +91,19 @@ def _objective(
     return count / MOST + over, {"p99": percentile, "samples": count}
 
 
-def _build(loop: "_Loop", most: int, own: dict[str, Array]) -> tuple[Mission, Array]:
+def _build(loop: "_Loop", most: int, own: dict[str, Any]) -> tuple[Mission, Array]:
     return loop.mission(own["samples"], own["places"], most), own["samples"]
 
 
 def _rounded(loop: "_Loop", ready: Ready, most: int, tuned: Tuned) -> Ready:
     """The best of the integers beside the number found, and their places tuned on: between two
     integers the samples lie elsewhere than at either."""
-    own, keys = tuned.design, _keys(0, ready.cases)
+    own, keys = jax.tree_util.tree_map(jnp.asarray, tuned.design), _keys(0, ready.cases)
     at = eqx.filter_jit(lambda n: ready.objective(ready.build(own | {"samples": n}), keys)[0])
     found = counted(lambda n: at(jnp.asarray(float(n))), own["samples"], tuned.loss, 2, most)
     count = jnp.asarray(float(found.count))
 
-    def build(places: dict[str, Array]) -> tuple[Mission, Array]:
+    def build(places: dict[str, Any]) -> tuple[Mission, Array]:
         return _build(loop, found.count, {"samples": count, **places})
 
     def objective(built: tuple[Mission, Array], keys: Array) -> tuple[Array, dict[str, Array]]:

@@ -71,7 +71,7 @@ def design(steps: int = 80, nominal: Extremal | None = None) -> Ready:
 
 
 def build(
-    nominal: Extremal, own: dict[str, Array], temperature: Any
+    nominal: Extremal, own: dict[str, Any], temperature: Any
 ) -> tuple[Mission, Float[Array, " g"]]:
     """The mission, and how far each station is there."""
     present = jnp.pad(occupancy(own["present"], temperature), 1, constant_values=1.0)

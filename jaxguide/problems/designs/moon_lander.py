@@ -49,7 +49,7 @@ def design(segments: int = 4, steps: int = 200) -> Ready:
     )
 
 
-def build(own: dict[str, Array]) -> Extremal:
+def build(own: dict[str, Any]) -> Extremal:
     method = dataclasses.replace(METHOD, fractions=own["breaks"])
     return solve(MoonLander(), method, throw=False)
 
