@@ -190,10 +190,11 @@ def structured(
     found: Arcs,
     watch: Callable[[Progress], None],
     corrections: int = _CORRECTIONS,
+    before: float = _WRONG,
 ) -> tuple[Extremal, float]:
     """The extremal of the structure `found`, and how wrong that is: its complementarity; infinite
     where it is not clear, not resolved or not feasible. Where multipliers tell what is wrong with
-    it, all its controls being at bounds, it is corrected by them."""
+    it, it is corrected by them, for as long as that makes it less wrong than `before`."""
     junctions, switches = found.junctions, found.switches(problem.m)
     clear = 0 < len(junctions) <= _MOST_JUNCTIONS and switches.any()
     if not clear or isinstance(problem, Endless):
@@ -214,7 +215,7 @@ def structured(
         kept = without_collapsed(found, ends)
         if 0 < len(kept.junctions) < len(junctions):
             watch(Progress("free knots closed arcs", exact, error))
-            return again(kept, corrections=corrections)
+            return again(kept, corrections=corrections, before=before)
     wrong = np.inf
     if sound and error <= method.mesh_tolerance:
         # A wrong structure shows in multipliers of the wrong sign, or bounds left between nodes.
@@ -223,12 +224,10 @@ def structured(
         if max(*left, value.get("path constraints", 0.0)) <= _BEYOND:
             wrong = value["complementarity"]
     watch(Progress(f"free knots, complementarity {wrong:.0e}", exact, error))
-    # Singular arcs are wrong in other ways.
-    held = bool(np.all(found.active[:, : problem.m]))
-    if corrections and held and _SOUND < wrong <= _WRONG:
+    if corrections and _SOUND < wrong < before:
         better = corrected(exact, found, ends)
         if len(better.junctions) > len(junctions):
-            other, less = again(better, corrections=corrections - 1)
+            other, less = again(better, corrections=corrections - 1, before=wrong)
             if less < wrong:
                 return other, less
     return exact, wrong
