@@ -122,13 +122,12 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     """
     size, rule, dtype = program.sizes, program.rule, program.dtype
     lo, hi = bounds_of(program.problem.control_bounds, size.m, dtype)
-    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    width = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), hi - lo, 0.0)
     x_lo, x_hi = bounds_of(program.problem.state_bounds, size.n, dtype)
     weights, along = jnp.asarray(rule.w, dtype), jnp.asarray((rule.support[1:] + 1) / 2, dtype)
 
     def flown(share: Array) -> tuple[Primal, Array]:
-        moved = jnp.where(bounded, share * (hi - lo), 0.0)
-        at = w._replace(u=w.u + jnp.where(bounded, moved, 0.0)[None, None])
+        at = w._replace(u=w.u + share * width[None, None])
         rates = lambda at: program.values(at)[0][:, :, : size.n]
         gained = jnp.einsum("k,skn->sn", weights, rates(at))
         start = w.x0[None] + jnp.cumsum(gained, axis=0) - gained
@@ -283,15 +282,12 @@ def duals(
     return {"y": Rows(defect, path, end), "net": net}
 
 
-def typical(
-    lo: Array, hi: Array, seen: Float[Array, "k n"], travel: Array | float = 0.0
-) -> Float[Array, " n"]:
-    """The larger finite bound; else the largest value seen; else the way travelled; else 1."""
+def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
+    """The larger finite bound; else the largest value seen; else 1."""
     bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
     wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
     scale = jnp.where(bounded & (wide > 0), wide, jnp.max(jnp.abs(seen), axis=0))
-    scale = jnp.where(scale > 1e-8, scale, travel)
-    return jnp.where((scale > 1e-8) & jnp.isfinite(scale), scale, 1.0)
+    return jnp.where(scale > 1e-8, scale, 1.0)
 
 
 def designer_units(program: Transcription, w: Primal) -> Scale:
@@ -299,10 +295,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     problem, size, dtype = program.problem, program.sizes, program.dtype
     x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
     u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
-    # What rests at zero along the guess, such as a free final position, is measured by its rate.
-    rate, _ = program.values(w)
-    travel = 2 * jnp.sum(jnp.max(jnp.abs(rate[:, :, : size.n]), axis=1), axis=0)
-    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]), travel)
+    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
     u = typical(u_lo, u_hi, jnp.zeros((1, size.m), dtype))
     t = jnp.maximum(w.times[1] - w.times[0], 1e-8)
     p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)
