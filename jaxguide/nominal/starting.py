@@ -120,29 +120,34 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     Where a start is singular at rest (a brachistochrone's, without speed), the middle control may
     leave them there: of three constant controls the one that fits the other states' rates best.
     """
-    size, rule, dtype = program.sizes, program.rule, program.dtype
-    lo, hi = bounds_of(program.problem.control_bounds, size.m, dtype)
+    problem, size, dtype = with_parameters(program.problem, None), program.sizes, program.dtype
+    lo, hi = bounds_of(problem.control_bounds, size.m, dtype)
     width = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), hi - lo, 0.0)
-    x_lo, x_hi = bounds_of(program.problem.state_bounds, size.n, dtype)
-    weights, along = jnp.asarray(rule.w, dtype), jnp.asarray((rule.support[1:] + 1) / 2, dtype)
+    spans = program.clocks @ w.times
+    h, middle = (spans[:, 1] - spans[:, 0])[:, None], (spans[:, 0] + spans[:, 1]) / 2
+    ends = jnp.concatenate([w.x0[None], w.x[:, -1]])
+    across, halfway = jnp.diff(ends, axis=0), (ends[1:] + ends[:-1]) / 2
+    rate = jax.jit(jax.vmap(problem.dynamics))  # traced once
 
-    def flown(share: Array) -> tuple[Primal, Array]:
-        at = w._replace(u=w.u + share * width[None, None])
-        rates = lambda at: program.values(at)[0][:, :, : size.n]
-        gained = jnp.einsum("k,skn->sn", weights, rates(at))
-        start = w.x0[None] + jnp.cumsum(gained, axis=0) - gained
-        x = start[:, None] + along[None, :, None] * gained[:, None]
-        x = jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), x_lo[None, None], x_hi[None, None])
-        at = at._replace(x=jnp.where(rests[None, None], x, w.x))
-        ends = jnp.concatenate([w.x0[None], at.x[:, -1]])
-        left = jnp.einsum("k,skn->sn", weights, rates(at)) - jnp.diff(ends, axis=0)
-        return at, jnp.sum(jnp.where(rests[None], 0.0, jnp.abs(left)))
+    def flown(share: Array) -> tuple[Array, Array]:
+        """What each segment adds to the states, and how ill that fits the others."""
+        u = w.u[:, 0] + share * width[None]
+        gained = h * rate(middle, halfway, u)
+        gained = jnp.where(rests[None] & jnp.isfinite(gained), gained, 0.0)
+        left = h * rate(middle, halfway + jnp.cumsum(gained, axis=0) - gained / 2, u) - across
+        return gained, jnp.sum(jnp.where(rests[None], 0.0, jnp.abs(left)))
 
-    tries, misfit = jax.vmap(flown)(jnp.asarray(_SHARES, dtype))
+    shares = jnp.asarray(_SHARES, dtype)
+    tries, misfit = jax.vmap(flown)(shares)
     misfit = jnp.where(jnp.isfinite(misfit), misfit, jnp.inf)
-    best = jnp.argmin(misfit * (1 + jnp.abs(jnp.asarray(_SHARES, dtype))))  # the middle if alike
-    chosen = jax.tree_util.tree_map(lambda a: a[best], tries)
-    return jax.tree_util.tree_map(lambda a, b: jnp.where(jnp.any(rests), a, b), chosen, w)
+    best = jnp.argmin(misfit * (1 + jnp.abs(shares)))  # the middle if alike
+    gained, share = tries[best], jnp.where(jnp.any(rests), shares[best], 0.0)
+    along = jnp.asarray((program.rule.support[1:] + 1) / 2, dtype)
+    start = jnp.cumsum(gained, axis=0) - gained
+    more = start[:, None] + along[None, :, None] * gained[:, None]
+    x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
+    x = jnp.where(rests[None, None], jnp.clip(w.x + more, x_lo[None, None], x_hi[None, None]), w.x)
+    return w._replace(x=x, u=w.u + (share * width)[None, None])
 
 
 def is_key(guess: Any) -> bool:
