@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxguide import plotting as plot
 from jaxguide.reproduce.ps_review import covectors, gaussian, rates, uniform, weighted
@@ -26,7 +27,7 @@ def write_figures(out: Path) -> list[str]:
 
 
 def axes(rows: int, columns: int, height: float, width: float = 0.72) -> Any:
-    figure = plot.Figure(figsize=(plot.WIDTH * width, height))
+    figure = Figure(figsize=(plot.WIDTH * width, height))
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
