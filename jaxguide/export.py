@@ -5,6 +5,7 @@ under its name when it is whole.
 """
 
 import csv
+import importlib
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -109,14 +110,17 @@ def _json_list(stream: TextIO, blocks: Iterator[list]) -> None:
         stream.write(f"{', ' if i and text else ''}{text}")
 
 
-def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
+def _optional(module: str, form: str) -> Any:
     try:
-        import pyarrow as pa
-        from pyarrow import parquet
+        return importlib.import_module(module)
     except ImportError as e:
         raise RuntimeError(
-            "export to Parquet needs pyarrow; install it with pip install 'jaxguide[export]'."
+            f"export to {form} needs {module}; install it with pip install 'jaxguide[export]'."
         ) from e
+
+
+def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
+    pa, parquet = _optional("pyarrow", "Parquet"), _optional("pyarrow.parquet", "Parquet")
     data = stores.opened(store)
     found = columns(data)
     rest = {k: json.dumps(told.get(k)) for k in ("sweep", "about", "summary")}
@@ -138,12 +142,7 @@ def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
 
 
 def _netcdf(store: Path, told: dict[str, Any], out: Path) -> None:
-    try:
-        import h5netcdf  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except ImportError as e:
-        raise RuntimeError(
-            "export to netCDF needs h5netcdf; install it with pip install 'jaxguide[export]'."
-        ) from e
+    _optional("h5netcdf", "netCDF")
     data = stores.opened(store)
     text = {k: json.dumps(stores.plain(v)) for k, v in data.attrs.items()}
     data = data.assign_attrs(text).assign_coords(

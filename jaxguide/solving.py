@@ -165,10 +165,9 @@ def _best(method: Pseudospectral, problem: Problem, guess: Any) -> Extremal:
         good, better = (bool(e.result == RESULTS.successful) for e in (best, other))
         if better and not (good and float(best.objective) <= float(other.objective)):
             best = other
-    coarse = dataclasses.replace(method, segments=_COARSE)
     if best.result != RESULTS.successful and guess is None and _has_ladder(method):
         # The ladder of grids from below (review, section 4.4): fewer nodes ask less of a guess.
-        below = _run(coarse, problem, None)
+        below = _run(dataclasses.replace(method, segments=_COARSE), problem, None)
         if below.result == RESULTS.successful:
             return _run(method, problem, below)
     return best

@@ -6,15 +6,33 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 
 
-def test_example(tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def run(code, folder):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     command = [sys.executable, "-c", code]
-    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
+    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
+def blocks(kind):
+    text = (ROOT / "README.md").read_text()
+    return re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
+
+
+def test_example(tmp_path):
+    (code,) = blocks("python")
+    run(code, tmp_path)
+
+
+@pytest.mark.slow
+def test_tuning_goes_on_from_the_example(tmp_path):
+    (begun,), (more,) = blocks("python"), blocks("py")
+    assert "Tuned: loss" in run(begun + more, tmp_path)
 
 
 def test_pictures_and_links_exist():

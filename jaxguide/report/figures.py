@@ -10,6 +10,7 @@ from jaxguide.plotting import COLOURS, WIDTH, align, ellipse, label, line, symbo
 from jaxguide.report.embed import INK
 
 SHOWN = 4000  # cases in a scatter; more only blacken it
+_ABREAST = 3  # panels of a figure
 _BLUE, _RED = COLOURS[1], COLOURS[2]
 _BANDS = ((1, 99, 0.18), (5, 95, 0.28), (25, 75, 0.4))
 
@@ -25,15 +26,21 @@ def shown_cases(data: Any) -> dict[str, np.ndarray]:
     }
 
 
+def _panels(count: int, height: float, more: float, **options: Any) -> tuple[Figure, np.ndarray]:
+    """`count` axes, `_ABREAST` of them in a row; `height` in of a row, `more` of the whole."""
+    columns = min(count, _ABREAST)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(1.15 * WIDTH, height * rows + more))
+    axes = figure.subplots(rows, columns, squeeze=False, **options).ravel()
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    return figure, axes
+
+
 def histograms(attrs: dict[str, Any], counts: np.ndarray) -> Figure | None:
     """How every quantity is spread about the undispersed flight, over all successful cases."""
     names = attrs["quantities"]
-    columns = min(len(names), 3)
-    rows = -(-len(names) // columns)
-    figure = Figure(figsize=(1.15 * WIDTH, 1.9 * rows + 0.3))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes[len(names) :]:
-        axis.set_visible(False)
+    figure, axes = _panels(len(names), 1.9, 0.3)
     edges = edges_of_bins()
     for i, (name, axis) in enumerate(zip(names, axes, strict=False)):
         total = counts[i].sum()
@@ -58,7 +65,7 @@ def histograms(attrs: dict[str, Any], counts: np.ndarray) -> Figure | None:
         axis.grid(axis="x", visible=False)
         if abs(centre) > 0 and name != "miss":
             axis.set_title(f"undispersed: {centre:.6g}", fontsize=7.5, loc="right")
-        if i % columns == 0:
+        if i % _ABREAST == 0:
             axis.set_ylabel("cases [%]")
     axes[0].legend(loc="best", fontsize=7)
     return figure
@@ -106,12 +113,7 @@ def corner(data: Any, cases: dict[str, np.ndarray]) -> Figure | None:
 def _ellipses_alone(names: list[str], pairs: Any) -> Figure:
     """The pairs, of a store that keeps no cases."""
     both = [(i, j) for i in range(len(names)) for j in range(i)]
-    columns = min(len(both), 3)
-    rows = -(-len(both) // columns)
-    figure = Figure(figsize=(1.15 * WIDTH, 2.2 * rows + 0.4))
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes[len(both) :]:
-        axis.set_visible(False)
+    figure, axes = _panels(len(both), 2.2, 0.4)
     for axis, (i, j) in zip(axes, both, strict=False):
         _ellipses(axis, *pairs(i, j))
         axis.set_xlabel(names[j])
@@ -135,13 +137,8 @@ def draws_against_miss(data: Any, cases: dict[str, np.ndarray], names: list[str]
     paths = dict.fromkeys(name.partition("[")[0] for name in names)  # in the order of the names
     y = cases["miss"]
     x = np.concatenate([cases[f"draw:{path}"].reshape(len(y), -1) for path in paths], axis=1)
-    columns = min(x.shape[1], 3)
-    rows = -(-x.shape[1] // columns)
-    figure = Figure(figsize=(1.15 * WIDTH, 1.9 * rows + 0.3))
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    figure, axes = _panels(x.shape[1], 1.9, 0.3, sharey=True)
     top = float(np.quantile(y, 0.998))
-    for axis in axes[x.shape[1] :]:
-        axis.set_visible(False)
     for i, axis in enumerate(axes[: x.shape[1]]):
         _dots(axis, x[:, i], y)
         groups = [g for g in np.array_split(np.argsort(x[:, i]), 20) if len(g)]
@@ -152,7 +149,7 @@ def draws_against_miss(data: Any, cases: dict[str, np.ndarray], names: list[str]
         axis.set_xlabel(names[i], fontsize=8)
         axis.set_ylim(0, top * 1.05 or 1.0)
         axis.locator_params(axis="x", nbins=4)
-        if i % columns == 0:
+        if i % _ABREAST == 0:
             axis.set_ylabel("miss")
     axes[0].legend(loc="upper center", fontsize=7, ncols=2)
     return figure
@@ -164,16 +161,10 @@ def sensitivities(attrs: dict[str, Any]) -> Figure | None:
     outcomes = [o for o in sampled if any(_number(v[0]) for v in sampled[o].values())]
     if not outcomes:
         return None
-    columns = min(len(outcomes), 3)
-    rows = -(-len(outcomes) // columns)
     entries = list(sampled[outcomes[0]])
     groups = [g for g in next(iter(linear.values()), {}) if g not in entries]
     ticks = entries + groups
-    height = (0.22 * len(ticks) + 0.75) * rows + 0.35
-    figure = Figure(figsize=(1.15 * WIDTH, height))
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for axis in axes[len(outcomes) :]:
-        axis.set_visible(False)
+    figure, axes = _panels(len(outcomes), 0.22 * len(ticks) + 0.75, 0.35, sharey=True)
     at = np.arange(len(ticks))
     for outcome, axis in zip(outcomes, axes, strict=False):
         told = [sampled[outcome].get(name, (None, None)) for name in ticks]
@@ -190,7 +181,7 @@ def sensitivities(attrs: dict[str, Any]) -> Figure | None:
         axis.set_xlim(min(0.0, float(np.nanmin(share - half))), 102)
         axis.grid(axis="y", visible=False)
     axes[0].invert_yaxis()
-    for axis in axes[max(0, len(outcomes) - columns) : len(outcomes)]:
+    for axis in axes[max(0, len(outcomes) - _ABREAST) : len(outcomes)]:
         axis.set_xlabel("share of variance [%]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
