@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from jaxguide import plotting as plot
 from jaxguide.flight.simulate import Flight
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.reproduce.earth_mars.published import CASES, STATES, UNITS
@@ -21,8 +23,6 @@ def write_figures(
     dataset: Any,
 ) -> list[str]:
     """Figures 2 to 9 of the paper, the gains, their errors, the sweep; returns the paths."""
-    from jaxguide import plotting as plot
-
     labels = []
     for k, case in enumerate(CASES):
         i = int(np.argmax(np.abs(case)))
@@ -51,15 +51,10 @@ def write_figures(
     return [plot.save(figures[name], out / f"earth-mars-{name}.png") for name in sorted(figures)]
 
 
-def overview(extremal: Extremal, schedule: GainSchedule, dataset: Any) -> Any:
+@plot.styled
+def overview(extremal: Extremal, schedule: GainSchedule, dataset: Any) -> Figure:
     """One picture of it all: the transfer with its thrust, the gains, the dispersed ends."""
-    from jaxguide import plotting as plot
-
-    return plot.styled(_overview)(extremal, schedule, dataset, plot)
-
-
-def _overview(extremal: Extremal, schedule: GainSchedule, dataset: Any, plot: Any) -> Any:
-    figure = plot.Figure(figsize=(9.0, 3.1))
+    figure = Figure(figsize=(9.0, 3.1))
     orbit, gains, ends = figure.subplots(1, 3)
 
     t = np.linspace(0.0, float(extremal.final_time), 401)

@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.figure import Figure
 
+from jaxguide import plotting as plot
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight
 from jaxguide.reproduce.lunar_launch.flights import CASES, TABLES, TARGET, deviations
@@ -26,13 +28,11 @@ def write_figures(
     dataset: Any,
 ) -> list[str]:
     """Writes them to the folder `out`; returns the paths."""
-    from jaxguide import plotting as plot
-
     seen = {law: _seen(loops[law], flown[law], law == "u") for law in loops}
     figures = {
-        "fig5-1-to-4-thrust": plot.styled(_compared)(seen, "5.3", plot),
-        "fig5-5-to-8-gravity": plot.styled(_compared)(seen, "5.4", plot),
-        "improvements": plot.styled(_improved)(ends, placed, plot),
+        "fig5-1-to-4-thrust": compared(seen, "5.3"),
+        "fig5-5-to-8-gravity": compared(seen, "5.4"),
+        "improvements": improved(ends, placed),
         "sweep": plot.plot_sweep(dataset, UNITS),
     }
     return [plot.save(figures[name], out / f"lunar-launch-{name}.png") for name in sorted(figures)]
@@ -53,8 +53,10 @@ def _seen(loop: Mission, flight: Flight, by_velocity: bool) -> tuple[np.ndarray,
     return t, np.where(over[:, :, None], np.nan, off)
 
 
-def _compared(seen: dict[str, tuple[np.ndarray, np.ndarray]], table: str, plot: Any) -> Any:
-    figure = plot.Figure(figsize=(plot.WIDTH, 4.6))
+@plot.styled
+def compared(seen: dict[str, tuple[np.ndarray, np.ndarray]], table: str) -> Figure:
+    """Figures 5.1 to 5.4 (table 5.3) or 5.5 to 5.8 (table 5.4)."""
+    figure = Figure(figsize=(plot.WIDTH, 4.6))
     axes = figure.subplots(2, 2, sharex=True)
     words = {"t": "time as reference", "u": "horizontal velocity as reference"}
     for panel, (axis, name) in enumerate(zip(axes.ravel(), PANELS, strict=True)):
@@ -83,8 +85,10 @@ def _compared(seen: dict[str, tuple[np.ndarray, np.ndarray]], table: str, plot: 
     return figure
 
 
-def _improved(ends: dict[str, np.ndarray], placed: Any, plot: Any) -> Any:
-    figure = plot.Figure(figsize=(plot.WIDTH, 3.4))
+@plot.styled
+def improved(ends: dict[str, np.ndarray], placed: Any) -> Figure:
+    """The error of y at the end by law, and the nodes placed by gradient with their loss."""
+    figure = Figure(figsize=(plot.WIDTH, 3.4))
     panels = figure.subplot_mosaic([["errors", "loss"], ["errors", "nodes"]], height_ratios=(6, 1))
     errors, loss, nodes = panels["errors"], panels["loss"], panels["nodes"]
     order = np.argsort(
