@@ -17,7 +17,6 @@ from jaxguide.problem import (
     Problem,
     bounds_of,
     count,
-    endpoint_count,
     initial_values,
     initially_free,
     is_free,
@@ -140,19 +139,17 @@ class Transcription(eqx.Module):
 
     @property
     def sizes(self) -> Sizes:
-        problem = self.problem
-        path, end = count(problem, "path_constraints"), endpoint_count(problem)
-        times = self.edges.shape[1]
+        problem, scale = self.problem, self.scale
         return Sizes(
             problem.n,
             problem.m,
-            self.scale.p.shape[0],
-            path,
-            end + (times - 1 if times > 2 else 0),
+            scale.p.shape[0],
+            scale.path.shape[0],
+            scale.end.shape[0],
             self.edges.shape[0] - 1,
             self.points,
             len(self.rule.support) - 1,
-            times,
+            self.edges.shape[1],
         )
 
     @property
@@ -207,6 +204,7 @@ class Transcription(eqx.Module):
         at = jnp.broadcast_to(at[:, None], (size.segments, self.points, at.shape[1]))
         return jnp.concatenate([x, w.u, at], axis=2)
 
+    @jax.jit  # traced once for all that is made of it
     def node(self, tau: Array, weight: Array, q: Float[Array, " in"]) -> Float[Array, " out"]:
         """(dt/dtau f, w dt/dtau F, h) at one node, scaled."""
         n, m, scale = self.problem.n, self.problem.m, self.scale
@@ -219,6 +217,7 @@ class Transcription(eqx.Module):
         cost = weight * rate * problem.running_cost(t, x, u) / scale.objective
         return jnp.concatenate([f, cost[None], problem.path_constraints(t, x, u) / scale.path])
 
+    @jax.jit
     def end(self, b: Float[Array, " in"]) -> Float[Array, " out"]:
         """(E, e) from (x0, times, p, xf), scaled."""
         n, scale = self.problem.n, self.scale
