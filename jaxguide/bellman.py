@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxguide.problem import Problem
 from jaxguide.solving import chosen, solve
 from jaxguide.trajectory import Extremal
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, succeeded
 
 
 class Bellman(eqx.Module):
@@ -52,7 +52,7 @@ def bellman(problem: Problem, method: Any = None, segments: int = 4, guess: Any 
     for k in range(segments):
         extremal = solve(problem, method, guess, throw=False)
         extremals.append(extremal)
-        if extremal.result != RESULTS.successful:
+        if not succeeded(extremal.result):
             break
         if not times:
             times, states = [extremal.t[0]], [extremal.x[0]]

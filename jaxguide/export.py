@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from jaxguide.montecarlo import store as stores
-from jaxguide.montecarlo.tiles import message
+from jaxguide.types import message
 
 _BLOCK = 65_536  # cases at once
 

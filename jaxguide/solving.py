@@ -1,8 +1,10 @@
 """`jg.solve`: from a Problem to a certified Extremal."""
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +20,7 @@ from jaxguide.nominal.shooting import Shooting
 from jaxguide.nominal.wrappers import closed, endless, opened
 from jaxguide.problem import Problem, is_free, validate, with_array_leaves
 from jaxguide.trajectory import Extremal
-from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
+from jaxguide.types import SolveError, is_traced, require_x64, succeeded
 
 _COARSE = 3  # segments of the mesh that is tried where the first one fails
 
@@ -82,12 +84,12 @@ def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Extrem
     if not isinstance(method, Shooting):
         return solve(problem, method, guess, throw, watch)
     extremal = solve(problem, method, guess, throw=False)
-    if extremal.result == RESULTS.successful:
+    if succeeded(extremal.result):
         return extremal
     direct = solve(problem, Pseudospectral(), throw=False, watch=watch)
-    if direct.result == RESULTS.successful:
+    if succeeded(direct.result):
         polished = solve(problem, method, direct, throw=False)
-        return polished if polished.result == RESULTS.successful else direct
+        return polished if succeeded(polished.result) else direct
     if throw:
         raise_if_failed(extremal)
     return extremal
@@ -162,13 +164,13 @@ def _best(method: Pseudospectral, problem: Problem, guess: Any) -> Extremal:
     best = _run(method, problem, guess)
     for k in range(1, method.starts):
         other = _run(method, problem, jax.random.fold_in(jax.random.key(method.seed), k))
-        good, better = (bool(e.result == RESULTS.successful) for e in (best, other))
+        good, better = (succeeded(e.result) for e in (best, other))
         if better and not (good and float(best.objective) <= float(other.objective)):
             best = other
-    if best.result != RESULTS.successful and guess is None and _has_ladder(method):
+    if not succeeded(best.result) and guess is None and _has_ladder(method):
         # The ladder of grids from below (review, section 4.4): fewer nodes ask less of a guess.
         below = _run(dataclasses.replace(method, segments=_COARSE), problem, None)
-        if below.result == RESULTS.successful:
+        if succeeded(below.result):
             return _run(method, problem, below)
     return best
 
@@ -184,7 +186,21 @@ def _run(method: Any, problem: Problem, guess: Any) -> Extremal:
         return compiled(called, True)(method, problem, guess)
     # In two programs, so that the optimiser's serves every guess and every mesh of its size.
     run = compiled(finished, method.quick)
-    return run(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
+    with _without_collection():
+        return run(problem, *_prepared(method, problem, guess), certifier(method.accuracy))
+
+
+@contextlib.contextmanager
+def _without_collection() -> Iterator[None]:
+    """Python's cyclic collector waits: it frees nothing of a program being traced, and took a
+    sixth of the time."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def called(method: Any, problem: Problem, guess: Any) -> Extremal:
@@ -208,5 +224,5 @@ def compiled(function: Callable[..., Any], quick: bool) -> Callable[..., Any]:
 
 def raise_if_failed(extremal: Extremal) -> None:
     """Raises `SolveError` unless `extremal.result` is success, naming the worst miss. Host only."""
-    if not bool(extremal.result == RESULTS.successful):
+    if not succeeded(extremal.result):
         raise SolveError(why(extremal))

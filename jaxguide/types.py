@@ -80,6 +80,24 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+def code(result: RESULTS) -> int:
+    """The number by which a result is stored. Host only."""
+    return int(result._value)  # pyright: ignore
+
+
+def succeeded(result: RESULTS) -> bool:
+    """Whether one result is success. Host only; `==` is what compares under a trace."""
+    return code(result) == code(RESULTS.successful)
+
+
+def message(number: int) -> str:
+    """The name of a stored result."""
+    for name in RESULTS._name_to_item:  # pyright: ignore
+        if code(getattr(RESULTS, name)) == number:
+            return name
+    return f"code {number}"
+
+
 class UnknownName(ValueError):
     """A name that is not registered; the message suggests the nearest that is."""
 

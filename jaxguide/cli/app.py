@@ -49,10 +49,10 @@ def solved(name: str, watch: Any = None) -> tuple[Any, Any]:
 
 
 def result_of(result: Any) -> dict[str, Any]:
-    from jaxguide.types import RESULTS
+    from jaxguide.types import RESULTS, succeeded
 
     message = RESULTS[result]
-    return {"ok": bool(result == RESULTS.successful), "message": message}
+    return {"ok": succeeded(result), "message": message}
 
 
 def folder(out: Path | None) -> Path | None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxguide.montecarlo.statistics import normal_quantile, wilson_bounds
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, code
 
 _BLOCK = 65_536  # cases read at once
 
@@ -28,7 +28,7 @@ def compare(a: Any, b: Any, quantity: str = "miss", confidence: float = 0.95) ->
     **Raises:** `ValueError` where the two did not draw the same, or keep no single cases.
     """
     cases = min(a.sizes["case"], b.sizes["case"])
-    good = int(RESULTS.successful._value)  # pyright: ignore[reportAttributeAccessIssue]
+    good = code(RESULTS.successful)
     drawn = sorted(str(name) for name in a.data_vars if str(name).startswith("draw:"))
     if drawn != sorted(str(name) for name in b.data_vars if str(name).startswith("draw:")):
         raise ValueError("compare: the sweeps disperse different leaves; fly both with the same.")

@@ -11,7 +11,7 @@ import equinox as eqx
 
 from jaxguide.montecarlo.statistics import wilson_bounds
 from jaxguide.montecarlo.tally import Tally
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, code
 
 LOOK = 16  # tiles between two looks; a power of two
 
@@ -42,7 +42,7 @@ class SuccessWithin(Stop):
         _positive("SuccessWithin", self.width, self.confidence)
 
     def enough(self, tally: Tally, names: tuple[str, ...], codes: Any) -> bool:
-        good, count = int(codes[int(RESULTS.successful._value)]), int(codes.sum())  # pyright: ignore
+        good, count = int(codes[code(RESULTS.successful)]), int(codes.sum())
         low, high = wilson_bounds(good, count, self.confidence)
         return high - low <= self.width
 

@@ -24,10 +24,10 @@ from jaxguide.montecarlo.statistics import wilson_bounds
 from jaxguide.montecarlo.stopping import LOOK, Stop, fitting
 from jaxguide.montecarlo.store import Memory, Store, Totals, differences
 from jaxguide.montecarlo.tally import Tally
-from jaxguide.montecarlo.tiles import TILE, Order, Tiles, code, message
+from jaxguide.montecarlo.tiles import TILE, Order, Tiles
 from jaxguide.montecarlo.written import dispersions_from
 from jaxguide.progress import NoProgress
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, code, message
 
 if TYPE_CHECKING:
     import xarray

@@ -19,7 +19,7 @@ from jaxguide.montecarlo.miss import end_errors, miss_distance
 from jaxguide.montecarlo.rollouts import apply, case_key, dimensions, draw, leaf_at, ordered, shared
 from jaxguide.montecarlo.sampling import Points, points
 from jaxguide.montecarlo.tally import BINS, count_in, tile_moments
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, code
 
 # Lanes flown together: their working set stays in a core's cache (chosen by experiment).
 TILE = 4096
@@ -275,16 +275,3 @@ def dispersed(
     u = None if spread_by is None else spread_by(case, mission.initial_state.dtype)
     draws = draw(mission, dispersions, k_draw, u)
     return apply(mission, draws), draws, k_noise
-
-
-def code(item: RESULTS) -> int:
-    """The number by which a result is stored."""
-    return int(item._value)  # pyright: ignore
-
-
-def message(number: int) -> str:
-    """The name of a stored result."""
-    for name in RESULTS._name_to_item:  # pyright: ignore
-        if code(getattr(RESULTS, name)) == number:
-            return name
-    return f"code {number}"

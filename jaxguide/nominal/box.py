@@ -28,6 +28,7 @@ class Box(NamedTuple):
     given: Entries
 
 
+@jax.jit
 def boxed(bounds: Bounds) -> Box:
     """Bounds with a little room; entries whose bounds coincide are given, but for states."""
     lo, hi = bounds
@@ -54,6 +55,7 @@ def inside(box: Box, w: Entries, push: Any) -> Entries:
     return _tree(one, w, box.lo, box.hi, box.below, box.above, box.given)
 
 
+@jax.jit
 def distances(box: Box, w: Entries) -> tuple[Entries, Entries]:
     """Distances to the bounds, 1 where there is none."""
     low = _tree(
@@ -78,6 +80,7 @@ def complementarity(box: Box, low: Entries, high: Entries, zl: Entries, zu: Entr
     return total(both) / jnp.maximum(count, 1.0)
 
 
+@jax.jit
 def barrier_value(box: Box, w: Entries, mu: Array) -> Array:
     """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
     low, high = distances(box, w)

@@ -5,16 +5,15 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.nominal import interior_point, newton
-from jaxguide.nominal.box import boxed, distances
+from jaxguide.nominal.box import Box, boxed, distances
 from jaxguide.nominal.mesh import left_null
 from jaxguide.nominal.shooting import unwrap_angles
-from jaxguide.nominal.transcription import Bounds, Transcription, bounds, node_times
+from jaxguide.nominal.transcription import Bounds, Transcription, flattened, node_times
 from jaxguide.problem import Problem, with_parameters
 from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
@@ -101,24 +100,21 @@ def to_extremal(
         ),
         result=result,
         residual=solution.violation,
-        degenerate=_undecided(program, solution),
+        degenerate=_undecided(box, solution),
         problem=problem,
         certifier=certifier,
     )
 
 
-def _undecided(program: Transcription, solution: interior_point.Solution) -> Bool[Array, ""]:
+def _undecided(bounds: Bounds, solution: interior_point.Solution) -> Bool[Array, ""]:
     """Whether a bound's distance and multiplier, whose product is the barrier mu, are both small:
     within a factor of 10 of sqrt(mu), where the barrier's derivative is off by a hundredth."""
-    box = boxed(bounds(program))
+    box = Box(*map(flattened, boxed(bounds)))
     small = 10 * jnp.sqrt(solution.mu)
     weak = lambda gap, z, on: jnp.any(on & (gap < small) & (z < small))
-    sides = zip(
-        distances(box, solution.w), (solution.zl, solution.zu),
-        (box.below, box.above), strict=True,
-    )  # fmt: skip
-    found = [jax.tree_util.tree_leaves(jax.tree_util.tree_map(weak, *side)) for side in sides]
-    return jnp.any(jnp.stack(found[0] + found[1]))
+    w, zl, zu = map(flattened, (solution.w, solution.zl, solution.zu))
+    low, high = distances(box, w)
+    return weak(low, zl, box.below) | weak(high, zu, box.above)
 
 
 def costates(

@@ -256,7 +256,8 @@ def _evaluated(program: Transcription, box: Box, s: _State) -> _Here:
     f, c = program.objective_and_residual(w, (nodes.value, ends.value))
     lagrangian = flattened(newton.gradient(program, nodes, ends, w, s.y))
     error = optimality_error(box, lagrangian, s.w, s.y, s.zl, s.zu, c)
-    return _Here(nodes, ends, f, c, *distances(box, s.w), error)
+    low, high = distances(box, s.w)
+    return _Here(nodes, ends, f, c, low, high, error)
 
 
 def _step(
@@ -336,9 +337,9 @@ def _step(
         dzl, dzu = duals(jnp.zeros_like(mu), step.primal)
         alpha = longest_step(low, high, step.primal, box, one)
         alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, one), longest_dual_step(s.zu, dzu, one))
-        ahead = distances(box, _move(s.w, alpha, step.primal))
+        low_, high_ = distances(box, _move(s.w, alpha, step.primal))
         zl, zu = _move(s.zl, alpha_z, dzl), _move(s.zu, alpha_z, dzu)
-        left = complementarity(box, *ahead, zl, zu) / jnp.where(gap > 0, gap, 1.0)
+        left = complementarity(box, low_, high_, zl, zu) / jnp.where(gap > 0, gap, 1.0)
         # It may not run ahead of the other conditions.
         floor = jnp.minimum(s.mu, jnp.minimum(_AHEAD * error_now, error_now**_THETA_MU))
         return jnp.clip(gap * left**3, jnp.maximum(least, floor), _MU_MAX)

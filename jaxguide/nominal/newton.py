@@ -89,6 +89,7 @@ def gather(
     return jax.linear_transpose(spread, like)((on_q, on_b, on_support))[0]
 
 
+@jax.jit
 def gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Rows) -> Primal:
     """Of the Lagrangian f + y^T c, from Jacobians at hand."""
     on_unknowns = gather(program, w, *forces(program, nodes, ends, y, 1.0))

@@ -27,7 +27,7 @@ from jaxguide.spectral import (
     nodes_lg,
 )
 from jaxguide.trajectory import Extremal
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, succeeded
 
 # How strongly breaks follow the error, and the share that smooth segments keep of the worst one's:
 # first choices, tried on five problems of the library and not tuned.
@@ -125,7 +125,7 @@ def refined(
     candidate, doubt = None, np.inf
     while raised <= method.refinements:
         errors = np.asarray(segment_errors(extremal))
-        if extremal.result != RESULTS.successful or not np.all(np.isfinite(errors)):
+        if not succeeded(extremal.result) or not np.all(np.isfinite(errors)):
             break
         found = arcs(extremal)
         resolved = errors.max() <= method.mesh_tolerance
@@ -159,7 +159,7 @@ def refined(
         better = run(method, problem, extremal)
         error = float(jnp.max(segment_errors(better)))
         watch(Progress(step, better, error))
-        if better.result != RESULTS.successful:
+        if not succeeded(better.result):
             break
         if error < errors.max() or step != "breaks moved":
             extremal = better
@@ -204,13 +204,13 @@ def structured(
     method = dataclasses.replace(method, tolerance=min(asked, _EXACT))
     knotted = _meshed(method, breaks, _KNOTTED_NODES, knots, known)
     exact = run(knotted, problem, extremal)
-    if exact.result != RESULTS.successful:
+    if not succeeded(exact.result):
         knotted = dataclasses.replace(knotted, tolerance=asked)
         exact = run(knotted, problem, exact)
     error = float(jnp.max(segment_errors(exact)))
     ends = np.asarray(exact.breaks)[edges]
     again = functools.partial(structured, run, original, problem, exact, watch=watch)
-    sound = exact.result == RESULTS.successful
+    sound = succeeded(exact.result)
     if sound:
         kept = without_collapsed(found, ends)
         if 0 < len(kept.junctions) < len(junctions):

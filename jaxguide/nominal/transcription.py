@@ -204,7 +204,6 @@ class Transcription(eqx.Module):
         at = jnp.broadcast_to(at[:, None], (size.segments, self.points, at.shape[1]))
         return jnp.concatenate([x, w.u, at], axis=2)
 
-    @jax.jit  # traced once for all that is made of it
     def node(self, tau: Array, weight: Array, q: Float[Array, " in"]) -> Float[Array, " out"]:
         """(dt/dtau f, w dt/dtau F, h) at one node, scaled."""
         n, m, scale = self.problem.n, self.problem.m, self.scale
@@ -217,7 +216,6 @@ class Transcription(eqx.Module):
         cost = weight * rate * problem.running_cost(t, x, u) / scale.objective
         return jnp.concatenate([f, cost[None], problem.path_constraints(t, x, u) / scale.path])
 
-    @jax.jit
     def end(self, b: Float[Array, " in"]) -> Float[Array, " out"]:
         """(E, e) from (x0, times, p, xf), scaled."""
         n, scale = self.problem.n, self.scale
@@ -237,6 +235,7 @@ class Transcription(eqx.Module):
         rule, dtype = self.rule, self.dtype
         return jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.w, dtype)
 
+    @jax.jit  # traced once a program, like those below
     def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
         over = jax.vmap(jax.vmap(self.node), in_axes=(None, None, 0))
         return over(*self._taus, self.inputs(w)), self.end(self.end_inputs(w))
@@ -249,6 +248,7 @@ class Transcription(eqx.Module):
         upper = legendre_matrix(jnp.asarray(self.rule.nodes, u.dtype))[self.points // 2 :]
         return jnp.einsum("sm,ij,sjm->sim", self.arcwise.smooth, upper.T @ upper, u)
 
+    @jax.jit
     def objective_and_residual(self, w: Primal, values: Any = None) -> tuple[Array, Rows]:
         """J of problem P and the constraints, scaled."""
         node, end = self.values(w) if values is None else values
@@ -260,6 +260,7 @@ class Transcription(eqx.Module):
         rough = jnp.sum(w.u * self.roughness(w.u)) / 2
         return jnp.sum(node[:, :, n]) + end[0] + rough, residual
 
+    @jax.jit
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
         """Values and Jacobians, node by node."""
         both = lambda f: lambda *a: (f(*a), f(*a))
@@ -305,6 +306,7 @@ class Bounds(NamedTuple):
     hi: Primal
 
 
+@jax.jit
 def bounds(program: Transcription) -> Bounds:
     """Bounds, scaled. Entries of `x0` and `times` that are given have both equal."""
     problem, scale, size = program.problem, program.scale, program.sizes
