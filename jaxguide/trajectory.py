@@ -9,9 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve
-from jaxguide.problem import Problem, hamiltonian
+from jaxguide.problem import Problem, bounds_of, hamiltonian
 from jaxguide.spectral import interpolate
 from jaxguide.types import RESULTS
+
+_FREE = 1e-7  # relative to the control's size: what a barrier's inactive bounds stay below
 
 
 class Point(NamedTuple):
@@ -71,11 +73,19 @@ class Trajectory(eqx.Module):
         """As `interpolate`, of values that may jump at the breaks."""
         return self._at(lambda s: parts[s], t)
 
+    def largest(self, values: Float[Array, "node k"], t: Any) -> Float[Array, " k"]:
+        """The largest nodal `values` of the segment that `t` is in."""
+        p = self.reference_nodes.shape[0]
+        s = self._segment(self.clock(jnp.asarray(t, self.t.dtype)), self.clock(self.breaks))
+        return jnp.max(jax.lax.dynamic_slice_in_dim(values, s * (p - 1), p), axis=0)
+
+    def _segment(self, t: Array, breaks: Array) -> Array:
+        return jnp.clip(jnp.searchsorted(breaks, t, side="right") - 1, 0, breaks.shape[0] - 2)
+
     def _at(self, pick: Callable, t: Any) -> Array:
         t = jnp.clip(jnp.asarray(t, self.t.dtype), self.t[0], self.t[-1])
         t, breaks = self.clock(t), self.clock(self.breaks)
-        last = breaks.shape[0] - 2
-        s = jnp.clip(jnp.searchsorted(breaks, t, side="right") - 1, 0, last)
+        s = self._segment(t, breaks)
         a, b = breaks[s], breaks[s + 1]
         tau = (2 * t - a - b) / jnp.where(b > a, b - a, 1.0)
         return interpolate(self.reference_nodes, pick(s), tau)
@@ -137,7 +147,9 @@ class Extremal(Trajectory):
         """State, control and costate at `t`, scalar or (T,); held beyond the horizon.
 
         The control comes from H_u = 0 at the interpolated state and costate where that is regular
-        (one Newton step from its interpolant, so an angle stays unwrapped), unless `parametric`.
+        (one Newton step from its interpolant, so an angle stays unwrapped), unless `parametric` or
+        something holds it within the segment: a bound of its own or a path constraint. H includes
+        what integral constraints add.
         """
         t = jnp.asarray(t, self.t.dtype)
         return jax.vmap(_polished, in_axes=(None, 0))(self, t) if t.ndim else _polished(self, t)
@@ -159,20 +171,35 @@ def _polished(extremal: Extremal, t: Array) -> Point:
     if extremal.parametric:
         return Point(x, u, costate)
     t = jnp.clip(t, extremal.t[0], extremal.t[-1])
-    return Point(x, polish_control(extremal.problem, t, x, u, costate), costate)
+    problem, integral = extremal.problem, extremal.multipliers.integral
+    force = jnp.zeros_like(u)
+    if extremal.u_before is not None:  # of a direct solution: something may hold its control
+        held = jnp.concatenate([extremal.multipliers.control, extremal.multipliers.path], axis=1)
+        largest = extremal.largest(jnp.abs(held), t)
+        h_u = jax.jacfwd(problem.path_constraints, argnums=2)(t, x, u)
+        force = largest[: len(u)] + largest[len(u) :] @ jnp.abs(h_u)
+    polished = polish_control(problem, t, x, u, costate, integral, force)
+    if extremal.u_before is not None:
+        polished = jnp.clip(polished, *bounds_of(problem.control_bounds, len(u), u.dtype))
+    return Point(x, polished, costate)
 
 
 @jax.jit
 def polish_control(
-    problem: Problem, t: Any, x: Array, u: Array, costate: Array
+    problem: Problem, t: Any, x: Array, u: Array, costate: Array, integral: Array, force: Array
 ) -> Float[Array, " m"]:
-    """One Newton step on H_u = 0 from a nearby `u`; `u` itself where that step is not small."""
-    gradient = jax.grad(hamiltonian, argnums=3)
-    h_u = gradient(problem, t, x, u, costate)
-    h_uu = jax.jacfwd(gradient, argnums=3)(problem, t, x, u, costate)
+    """One Newton step on H_u = 0 from a nearby `u`; `u` itself where that step is not small, or
+    where the `force` of constraints on the control would move it by more than `_FREE`."""
+
+    def stated(u: Array) -> Array:
+        h = hamiltonian(problem, t, x, u, costate)
+        return h + jnp.dot(integral, problem.integrands(t, x, u)) if len(integral) else h
+
+    gradient = jax.grad(stated)
+    h_u, h_uu = gradient(u), jax.jacfwd(gradient)(u)
     # Double where: a singular H_uu must not leak NaN into derivatives of the branch not taken.
     scale = jnp.max(jnp.abs(h_uu))
-    regular = scale > 0
+    regular = (scale > 0) & jnp.all(force <= _FREE * scale * (1 + jnp.abs(u)))
     safe = jnp.where(regular, h_uu, jnp.eye(u.shape[0], dtype=u.dtype))
     step = solve(safe, h_u)
     small = regular & jnp.all(jnp.abs(step) <= 1e-3 * (1 + jnp.abs(u)))

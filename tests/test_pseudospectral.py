@@ -315,6 +315,36 @@ class Undefined(DoubleIntegrator):
         return jnp.stack([x[1], u[0] + 0.1 * jnp.log(0.7 - x[0])])
 
 
+class Held(jg.Problem):
+    """u would be 1.0005 but may not exceed 1; w would be 0 but for its integral of 1e-4."""
+
+    state_names = ("x",)
+    control_names = ("u", "w")
+    initial_state = (0.0,)
+    control_bounds = (-jnp.inf, jnp.array([1.0, jnp.inf]))
+    integral_bounds = (1e-4, jnp.inf)
+
+    def dynamics(self, t, x, u):
+        return u[:1]
+
+    def running_cost(self, t, x, u):
+        return ((u[0] - 1.0005) ** 2 + u[1] ** 2) / 2
+
+    def integrands(self, t, x, u):
+        return u[1:]
+
+
+def test_controls_between_nodes_keep_to_bounds_and_integrals():
+    e = jg.solve(Held(), jg.Pseudospectral(nodes=4, segments=2, refinements=0))
+    u = np.asarray(e(jnp.array([0.1, 0.5, 0.93])).u)
+    # The barrier ends below 1e-9, over the bound's multiplier of 5e-4.
+    np.testing.assert_allclose(u[:, 0], 1.0, atol=5e-6)
+    assert np.all(u[:, 0] <= 1)
+    np.testing.assert_allclose(u[:, 1], 1e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="integral constraints"):
+        jg.linearize(e, jnp.array([0.1]))
+
+
 def test_failures_name_what_is_wrong():
     method = jg.Pseudospectral(nodes=4, segments=2)
     with pytest.raises(jg.SolveError, match=r"d\(v\)/dt is nan at node \d+ \(t = .*mend"):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve
 from jaxguide.neighboring.collocated import solve_horizons
-from jaxguide.neighboring.linearization import terminal_conditions
+from jaxguide.neighboring.linearization import refuse_integrals, terminal_conditions
 from jaxguide.neighboring.segmented import (
     NODES,
     SEGMENTS,
@@ -23,7 +23,7 @@ from jaxguide.neighboring.segmented import (
     propagate,
     solve_sweeps,
 )
-from jaxguide.problem import Problem, bounds_of, is_free
+from jaxguide.problem import bounds_of, is_free
 from jaxguide.spectral import interpolate
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, is_traced, require_x64
@@ -158,11 +158,12 @@ def gain_schedule(
     **Error:** `.error` estimates it: for "segmented" by a solution of higher order plus what
     rounding can do, for the others by comparison with the segmented gains.
 
-    **Raises:** `ValueError` for bad times or options, naming the value.
+    **Raises:** `ValueError` for bad times or options, naming the value; for integral constraints.
 
     **Source:** Yan, Fahroo & Ross (2002), eqs (11)-(21), (33)-(49).
     """
     require_x64("jg.gain_schedule")
+    refuse_integrals(extremal, "gain_schedule")
     times = jnp.asarray(times, extremal.t.dtype)
     if extremal.parametric:
         raise ValueError(
@@ -244,7 +245,7 @@ def _segmented(
         error=error,
         resolved=fine_enough & convex_ahead & ~conjugate,
         result=result,
-        bound_active=_bound_active(problem, pair.control),
+        bound_active=_bound_active(extremal, times, pair.control),
         K_parameters=gains.K[0, :, :, n : n + p],
         K_target=gains.K[0, :, :, n + p :],
         dtf_dx=gains.time[0, :, :n],
@@ -253,11 +254,21 @@ def _segmented(
     )
 
 
-def _bound_active(problem: Problem, u: Float[Array, "time m"]) -> Bool[Array, " time"]:
-    """Where a control sits on its bound, so that a linear law is one-sided there."""
-    lo, hi = bounds_of(problem.control_bounds, problem.m, u.dtype)
-    room = 1e-6 * (1 + jnp.abs(u))
-    return jnp.any((u <= lo[None] + room) | (u >= hi[None] - room), axis=1)
+def _bound_active(
+    extremal: Extremal, times: Array, u: Float[Array, "time m"]
+) -> Bool[Array, " time"]:
+    """Where control, state or path constraints sit on a bound: a linear law is one-sided there."""
+    problem, dtype = extremal.problem, u.dtype
+    x = jax.vmap(extremal.point)(times).x
+
+    def touches(values: Float[Array, "time k"], bounds: Any) -> Bool[Array, " time"]:
+        lo, hi = bounds_of(bounds, values.shape[1], dtype)
+        room = 1e-6 * (1 + jnp.abs(values))
+        return jnp.any((values <= lo[None] + room) | (values >= hi[None] - room), axis=1)
+
+    path = jax.vmap(problem.path_constraints)(times, x, u)
+    on_states = touches(x, problem.state_bounds)
+    return touches(u, problem.control_bounds) | on_states | touches(path, problem.path_bounds)
 
 
 @eqx.filter_jit

@@ -193,6 +193,16 @@ class LinearTPBVP(eqx.Module):
     dtf_dlambda: Float[Array, " n"]
 
 
+def refuse_integrals(extremal: Extremal, what: str) -> None:
+    """Raises `ValueError` if integral constraints bind the extremal's neighbours together."""
+    if extremal.multipliers.integral.shape[-1]:
+        raise ValueError(
+            f"{what}: {type(extremal.problem).__name__} has integral constraints, of which the "
+            "second variation knows nothing; state each integral as a further state that starts "
+            "at 0 and is constrained at the end."
+        )
+
+
 def linearize(extremal: Extremal, t: Any) -> LinearTPBVP:
     """The linear TPBVP of neighbouring extremals about `extremal` at times `t` (T,).
 
@@ -205,6 +215,7 @@ def linearize(extremal: Extremal, t: Any) -> LinearTPBVP:
     t = jnp.asarray(t, extremal.t.dtype)
     if t.ndim != 1:
         raise ValueError(f"linearize: t has shape {t.shape}; give a vector of times (T,).")
+    refuse_integrals(extremal, "linearize")
     n = extremal.problem.n
 
     def at(t: Array) -> tuple[SecondVariation, Canonical]:
