@@ -309,6 +309,27 @@ def _check_bounds(problem: Problem, name: str, size: int) -> None:
         )
 
 
+def _check_start(problem: Problem, x0: Any) -> None:
+    """Refuses an initial state, or a range of one, outside the state bounds."""
+    lower, upper = (
+        np.broadcast_to(np.asarray(b, float), (problem.n,)) for b in problem.state_bounds
+    )
+    entries = problem.initial_state
+    for i, name in enumerate(problem.state_names):
+        entry = entries[i] if isinstance(entries, (tuple, list)) else entries
+        free = is_free(entry) and np.ndim(entry.lo) == np.ndim(entry.hi) == 0
+        if entry is None or (is_free(entry) and not free):
+            continue
+        lo, hi = (float(entry.lo), float(entry.hi)) if free else (float(x0[i]), float(x0[i]))
+        slack = 1e-9 * (1 + abs(x0[i]))
+        if hi < lower[i] - slack or lo > upper[i] + slack:
+            given = f"between {lo} and {hi}" if free else f"{lo}"
+            raise ValueError(
+                f"{type(problem).__name__}.initial_state: {name} is {given}, outside state_bounds "
+                f"[{lower[i]}, {upper[i]}]; mend one of the two."
+            )
+
+
 def validate(problem: Problem) -> None:
     """Refuses a badly stated problem, naming the field, its value and the remedy.
 
@@ -367,6 +388,7 @@ def validate(problem: Problem) -> None:
                 f"{kind}.initial_state: {name} is {x0[i]}; give a finite number"
                 + (" as the guess of its jg.Free." if free[i] else " or jg.Free().")
             )
+    _check_start(problem, x0)
     t0, tf = float(t0), float(tf)
     if math.isnan(t0) or math.isnan(tf) or math.isinf(t0):
         raise ValueError(f"{kind}: initial_time is {t0} and final_time is {tf}; give numbers.")

@@ -56,6 +56,10 @@ def solve(
     if method is None and not is_traced((problem, guess)):
         return _by_default(problem, guess, throw, watch)
     method = chosen(problem) if method is None else method
+    if isinstance(method, type) or not hasattr(method, "check_fields"):
+        raise ValueError(
+            f"jg.solve: method is {method!r}; give an instance, such as jg.Pseudospectral()."
+        )
     if isinstance(problem, Problem):
         method.check_fields(problem)
     validate(problem)

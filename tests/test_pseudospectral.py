@@ -308,6 +308,36 @@ def test_relaxed_dynamics_cost_less():
     assert e.u.shape[1] == 1
 
 
+def test_what_cannot_be_fails_in_its_lane():
+    """Bounds and horizons that `validate` cannot see under a trace."""
+    method = jg.Pseudospectral(nodes=4, segments=2, refinements=0)
+    solve = jax.jit(lambda p: jg.solve(p, method, throw=False).result)
+    of = lambda **changed: dataclasses.replace(DoubleIntegrator(), **changed)
+    right = of(control_bounds=(-9.0, 9.0), final_time=1.0)
+    upside_down = of(control_bounds=(9.0, -9.0), final_time=1.0)
+    backwards = of(control_bounds=(-9.0, 9.0), final_time=-1.0)
+    assert jg.RESULTS[solve(right)] == ""
+    for wrong in (upside_down, backwards):
+        assert solve(wrong) == jg.RESULTS.infeasible
+    # Sequences of any kind are the same static field.
+    kinds = ([1e-3, 1e-3], (1e-3, 1e-3), np.array([1e-3, 1e-3]))
+    assert len({jg.Pseudospectral(relaxation=kind).relaxation for kind in kinds}) == 1
+
+
+@pytest.mark.parametrize("start", [(0.0, 0.0), (jg.Free(-1.0, 0.25), 0.0)])
+def test_a_start_outside_its_bounds_is_refused(start):
+    problem = dataclasses.replace(
+        DoubleIntegrator(), initial_state=start, state_bounds=((0.5, -9.0), (2.0, 9.0))
+    )
+    with pytest.raises(ValueError, match=r"x is .*outside state_bounds \[0.5, 2.0\]"):
+        jg.solve(problem, jg.Pseudospectral())
+
+
+def test_a_method_is_an_instance():
+    with pytest.raises(ValueError, match=r"give an instance, such as jg.Pseudospectral\(\)"):
+        jg.solve(DoubleIntegrator(), jg.Pseudospectral)
+
+
 class Undefined(DoubleIntegrator):
     initial_state = (0.5, 0.0)
 

@@ -188,7 +188,12 @@ def optimality_error(
 
 
 def minimise(program: Transcription, bounds: Bounds, start: Start, options: Options) -> Solution:
-    """Iterates from `start` to a point that meets the first-order conditions, or says why not."""
+    """Iterates from `start` to a point that meets the first-order conditions, or says why not.
+
+    Contradictory bounds, and a horizon that cannot be positive, are infeasible at once.
+    """
+    impossible = jnp.any(flattened(bounds.lo) > flattened(bounds.hi))
+    impossible = impossible | (bounds.hi.times[1] <= bounds.lo.times[0])
     box = Box(*map(flattened, boxed(bounds)))
     dtype = program.dtype
     w, net = inside(box, flattened(start.w), options.push), flattened(start.net)
@@ -205,7 +210,7 @@ def minimise(program: Transcription, bounds: Bounds, start: Start, options: Opti
         w, start.y, zl, zu, mu,
         _Filter(slots, slots, nought),
         1e4 * jnp.maximum(1.0, theta), 1e-4 * jnp.maximum(1.0, theta), theta,
-        zero, mode, nought, nought + RUNNING, zero + jnp.inf,
+        zero, mode, nought, jnp.where(impossible, nought + INFEASIBLE, RUNNING), zero + jnp.inf,
         jnp.array(False), jnp.full(_MEMORY, jnp.inf, dtype),
     )  # fmt: skip
     body = lambda s: _pass(program, box, options, s)

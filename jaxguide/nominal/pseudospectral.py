@@ -39,6 +39,12 @@ from jaxguide.types import is_traced
 _MOST_NODES = 512
 
 
+def hashable(numbers: Any) -> Any:
+    """A number, or a tuple of the numbers of any sequence: what a static field can hold."""
+    numbers = np.asarray(numbers, float)
+    return tuple(numbers.tolist()) if numbers.ndim else float(numbers)
+
+
 class Pseudospectral(eqx.Module):
     """Direct collocation on one or many segments, solved by the interior-point method.
 
@@ -82,8 +88,8 @@ class Pseudospectral(eqx.Module):
     fractions: Any = None
     knots: tuple[int, ...] = eqx.field(static=True, default=())
     arcwise: Arcwise | None = None
-    smoothing: Any = eqx.field(static=True, default=0.0)
-    relaxation: Any = eqx.field(static=True, default=0.0)
+    smoothing: Any = eqx.field(static=True, default=0.0, converter=hashable)
+    relaxation: Any = eqx.field(static=True, default=0.0, converter=hashable)
     time_scale: float = eqx.field(static=True, default=1.0)
     starts: int = eqx.field(static=True, default=1)
     seed: int = eqx.field(static=True, default=0)
