@@ -192,6 +192,16 @@ def initially_free(problem: Problem) -> tuple[bool, ...]:
     return (entries is None or is_free(entries),) * problem.n
 
 
+def initial_entries(problem: Problem) -> tuple[Any, ...]:
+    """One entry a state: a number or `Free`."""
+    start = problem.initial_state
+    if isinstance(start, (tuple, list)):
+        return tuple(start)
+    if start is None or is_free(start):
+        return (Free() if start is None else start,) * problem.n
+    return tuple(start[i] for i in range(problem.n))
+
+
 def initial_values(problem: Problem, dtype: Any) -> Float[Array, " n"]:
     """Initial state, free components at their guess (or 0)."""
     entries = problem.initial_state
@@ -314,12 +324,10 @@ def _check_start(problem: Problem, x0: Any) -> None:
     lower, upper = (
         np.broadcast_to(np.asarray(b, float), (problem.n,)) for b in problem.state_bounds
     )
-    entries = problem.initial_state
-    for i, name in enumerate(problem.state_names):
-        entry = entries[i] if isinstance(entries, (tuple, list)) else entries
-        free = is_free(entry) and np.ndim(entry.lo) == np.ndim(entry.hi) == 0
-        if entry is None or (is_free(entry) and not free):
-            continue
+    for i, (name, entry) in enumerate(
+        zip(problem.state_names, initial_entries(problem), strict=True)
+    ):
+        free = is_free(entry)
         lo, hi = (float(entry.lo), float(entry.hi)) if free else (float(x0[i]), float(x0[i]))
         slack = 1e-9 * (1 + abs(x0[i]))
         if hi < lower[i] - slack or lo > upper[i] + slack:

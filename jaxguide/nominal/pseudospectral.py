@@ -39,7 +39,7 @@ from jaxguide.types import is_traced
 _MOST_NODES = 512
 
 
-def hashable(numbers: Any) -> Any:
+def _hashable(numbers: Any) -> Any:
     """A number, or a tuple of the numbers of any sequence: what a static field can hold."""
     numbers = np.asarray(numbers, float)
     return tuple(numbers.tolist()) if numbers.ndim else float(numbers)
@@ -88,8 +88,8 @@ class Pseudospectral(eqx.Module):
     fractions: Any = None
     knots: tuple[int, ...] = eqx.field(static=True, default=())
     arcwise: Arcwise | None = None
-    smoothing: Any = eqx.field(static=True, default=0.0, converter=hashable)
-    relaxation: Any = eqx.field(static=True, default=0.0, converter=hashable)
+    smoothing: Any = eqx.field(static=True, default=0.0, converter=_hashable)
+    relaxation: Any = eqx.field(static=True, default=0.0, converter=_hashable)
     time_scale: float = eqx.field(static=True, default=1.0)
     starts: int = eqx.field(static=True, default=1)
     seed: int = eqx.field(static=True, default=0)

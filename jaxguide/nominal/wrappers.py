@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.problem import Free, Problem, bounds_of, count, endpoint_count, is_free
+from jaxguide.problem import Problem, bounds_of, count, endpoint_count, initial_entries
 from jaxguide.trajectory import Extremal, Multipliers
 
 
@@ -53,16 +53,6 @@ def _of(problem: Problem, **changed: Any) -> dict[str, Any]:
 
 def _joined(a: tuple, b: tuple) -> tuple[Array, Array]:
     return jnp.concatenate([a[0], b[0]]), jnp.concatenate([a[1], b[1]])
-
-
-def initial_entries(problem: Problem) -> tuple[Any, ...]:
-    """One entry a state: a number or `Free`."""
-    start = problem.initial_state
-    if isinstance(start, (tuple, list)):
-        return tuple(start)
-    if start is None or is_free(start):
-        return (Free() if start is None else start,) * problem.n
-    return tuple(start[i] for i in range(problem.n))
 
 
 def rewrapped(whole: Problem, problem: Problem) -> Problem:
