@@ -26,7 +26,8 @@ def blocks(kind):
 
 def test_example(tmp_path):
     (code,) = blocks("python")
-    run(code, tmp_path)
+    printed = run(code, tmp_path)
+    assert "transversality" in printed and "final_state" in printed  # certificate and flights
 
 
 @pytest.mark.slow

@@ -10,8 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.nominal.wrappers import initial_entries
-from jaxguide.problem import Free, Problem, bounds_of, count, endpoint_count, is_free, start_value
+from jaxguide.problem import (
+    Free,
+    Problem,
+    bounds_of,
+    count,
+    endpoint_count,
+    initial_entries,
+    is_free,
+    start_value,
+)
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import is_traced
 
