@@ -16,13 +16,16 @@ from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, conjugate_ah
 from jaxguide.nominal.conditions import endpoint_lagrangian
 from jaxguide.nominal.wrappers import closed
 from jaxguide.problem import (
+    Free,
     Problem,
     bounds_of,
     hamiltonian,
+    initial_entries,
     initial_values,
     initially_free,
     is_free,
 )
+from jaxguide.sizes import sizes_of
 from jaxguide.spectral import interpolation_matrix, legendre_matrix, nodes_lg
 from jaxguide.trajectory import Extremal
 
@@ -161,12 +164,11 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     rows = _Rows()
     states = problem.state_names
     costates = tuple(f"costate of {name}" for name in states)
-    span = jnp.max(jnp.abs(x), axis=0) + 1e-300
-    lam_span = jnp.max(jnp.abs(costate)) + jnp.abs(_cost_scale(extremal)) + 1e-300
+    size, multipliers = sizes_of(extremal), extremal.multipliers
 
     if costly:
         flown = _propagate(extremal)
-        rows.add("propagated state", states, (flown - x) / (1e-3 + span)[None], t, 1e-8)
+        rows.add("propagated state", states, (flown - x) / size.x[None], t, 1e-8)
         # The last break with one ahead is just before it: 1 there, 0 where there is none.
         ahead = _conjugate(extremal)
         last = jnp.where(jnp.any(ahead), ahead.shape[0] - 1 - jnp.argmax(ahead[::-1]), 0)
@@ -183,7 +185,6 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     at = lambda parts: jnp.einsum("gp,spk->sgk", to_gauss, parts)
     u_parts, lam_parts = extremal.control_by_segment(), extremal.costate_by_segment()
     gx, gu, glam = at(extremal.by_segment(x)), at(u_parts), at(lam_parts)
-    multipliers = extremal.multipliers
     integral = jnp.broadcast_to(multipliers.integral, (len(t), len(multipliers.integral)))
     constraints = (multipliers.path, multipliers.state, multipliers.control)
     held = jnp.concatenate([*constraints, integral], axis=1)
@@ -195,28 +196,31 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     step = extremal.reference_nodes.shape[0] - 1
     ends = lambda parts: parts[:, -1] - parts[:, 0]
     moved, turned = ends(extremal.by_segment(x)), ends(lam_parts)
-    scaled = (moved - quad(f)) / (1e-3 + span)[None]
-    rows.add("state equation", states, scaled, breaks[1:], tight)
-    rows.add("costate equation", costates, (turned + quad(h_x)) / lam_span, breaks[1:], tight)
+    rows.add("state equation", states, (moved - quad(f)) / size.x[None], breaks[1:], tight)
+    scaled = (turned + quad(h_x)) / size.costate[None]
+    rows.add("costate equation", costates, scaled, breaks[1:], tight)
 
     # Boundary data and transversality, eqs (3), (8), (9).
     x0, xf, t0, tf = x[0], x[-1], t[0], t[-1]
     e = problem.endpoint_constraints(x0, xf, t0, tf)
-    lo, hi = bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)
-    miss = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
     labels = [f"constraint {i}" for i in range(e.shape[0])]
+    miss = _overstep(e, problem.endpoint_bounds) / size.end
     rows.add("endpoint constraints", labels, miss[None], tf[None], tight)
-    given, free = initial_values(problem, x.dtype), initially_free(problem)
     g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))(
-        problem, extremal.multipliers.endpoint, x0, xf, t0, tf
+        problem, multipliers.endpoint, x0, xf, t0, tf
     )
-    free_mask = jnp.asarray(free)
-    rows.add("initial state", states, jnp.where(free_mask, 0.0, x0 - given)[None], t0[None], tight)
-    # A bound met at the very end may have a covector of its own there.
-    gap = _slackness((costate[-1] - g[1]) / lam_span, xf, problem.state_bounds)
+    signs = _slackness(multipliers.endpoint, e, problem.endpoint_bounds, size.end)
+    signs = signs * size.end / size.cost
+    rows.add("complementarity, ends", labels, signs[None], tf[None], tight)
+    given, free = initial_values(problem, x.dtype), jnp.asarray(initially_free(problem))
+    miss = jnp.where(free, _overstep(x0, _initial_bounds(problem)), x0 - given) / size.x
+    rows.add("initial state", states, miss[None], t0[None], tight)
+    # A bound met at either end may have a covector of its own there.
+    gap = _slackness(costate[-1] - g[1], xf, problem.state_bounds, size.x) / size.costate
     rows.add("transversality, end", costates, gap[None], tf[None], tight)
-    if any(free):
-        gap = jnp.where(free_mask, costate[0] + g[0], 0.0) / lam_span
+    if any(initially_free(problem)):
+        gap = _slackness(-(costate[0] + g[0]), x0, _initial_bounds(problem), size.x) / size.costate
+        gap = jnp.where(free, gap, 0.0)
         rows.add("transversality, start", costates, gap[None], t0[None], tight)
 
     # The Hamiltonian: stationary in u, and dH/dt = H_t along the extremal.
@@ -225,21 +229,25 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
         return hamiltonian(problem, t, x, u, costate) + gain
 
     h_node = jax.vmap(value)(t, x, u, costate)
-    h_scale = 1e-3 * lam_span + jnp.max(jnp.abs(h_node))
+    of_time = lambda gap, t, entry: (
+        _slackness(gap[None], t[None], (entry.lo, entry.hi), size.t[None])[None] / size.hamiltonian
+    )
+    if is_free(problem.initial_time):
+        gap = of_time(h_node[0] - g[2], t0, problem.initial_time)
+        rows.add("H at the start", ("H",), gap, t0[None], tight)
     if is_free(problem.final_time):
-        rows.add(
-            "H at the end", ("H",), ((h_node[-1] + g[3]) / h_scale)[None, None], tf[None], tight
-        )
+        gap = of_time(-(h_node[-1] + g[3]), tf, problem.final_time)
+        rows.add("H at the end", ("H",), gap, tf[None], tight)
     h_t = over(jax.grad(constrained_hamiltonian, argnums=1))(times, gx, gu, glam, gheld)
     if extremal.costate_before is not None:
         # At a break the costate may jump, by a covector of a bound that is met there.
-        jumps = (extremal.costate_before[:-1] - costate[step:-1:step]) / lam_span
-        held_there = jax.vmap(_slackness, in_axes=(0, 0, None))(
-            jumps, x[step:-1:step], problem.state_bounds
+        jumps = extremal.costate_before[:-1] - costate[step:-1:step]
+        held_there = jax.vmap(_slackness, in_axes=(0, 0, None, None))(
+            jumps, x[step:-1:step], problem.state_bounds, size.x
         )
-        rows.add("costate jumps", costates, held_there, breaks[1:-1], tight)
+        rows.add("costate jumps", costates, held_there / size.costate[None], breaks[1:-1], tight)
     drift = jnp.cumsum(half * jnp.einsum("g,sg->s", weights, h_t))
-    gap = (h_node[step::step] - h_node[0] - drift) / h_scale
+    gap = (h_node[step::step] - h_node[0] - drift) / size.hamiltonian
     rows.add("Hamiltonian rate", ("H",), gap[:, None], breaks[1:], tight)
     if is_free(problem.final_time):
         # Where controls jump between nodes the pointwise value misleads; its mean, by the nodes'
@@ -252,20 +260,20 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
         mean = jnp.sum(2 * half * (parts @ own)) / (tf - t0)
         ahead = drift[-1] - jnp.concatenate([jnp.zeros(1, t.dtype), drift[:-1]])
         ahead = jnp.sum(half * 2 * ahead) / (tf - t0)
-        rows.add(
-            "H on average", ("H",), ((mean + ahead + g[3]) / h_scale)[None, None], tf[None], tight
-        )
+        gap = of_time(-(mean + ahead + g[3]), tf, problem.final_time)
+        rows.add("H on average", ("H",), gap, tf[None], tight)
     h_u = jax.vmap(jax.grad(constrained_hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0, 0))(
         problem, t, x, u, costate, held
     )
-    rows.add("stationarity H_u", problem.control_names, h_u / h_scale, t, tight)
+    scaled = h_u * (size.u / size.hamiltonian)[None]
+    rows.add("stationarity H_u", problem.control_names, scaled, t, tight)
     if extremal.parametric:
         # Of node values: H_u vanishes weighted by the hat function of each node (thesis, eq. 4.33).
         inside = over(jax.grad(constrained_hamiltonian, argnums=3))(times, gx, gu, glam, gheld)
         before, after = (quad((1 + sign * gauss)[None, :, None] / 2 * inside) for sign in (-1, 1))
         none = jnp.zeros_like(before[:1])
         hats = jnp.concatenate([before, none]) + jnp.concatenate([none, after])
-        hats = hats / (h_scale * (tf - t0))
+        hats = hats * (size.u / (size.hamiltonian * size.t))[None]
         rows.add("stationarity of node values", problem.control_names, hats, breaks, tight)
     h_uu = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
         problem, t, x, u, costate
@@ -275,72 +283,88 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     worst = jnp.argmin(least)
     rows.add_signed("Legendre-Clebsch", ("-min eig H_uu",), -least[worst], t[worst], 0.0)
 
-    for name, labels, values, bounds in (
-        ("state bounds", states, x, problem.state_bounds),
-        ("control bounds", problem.control_names, u, problem.control_bounds),
+    h = jax.vmap(problem.path_constraints)(t, x, u)
+    paths = tuple(f"path {i}" for i in range(h.shape[1]))
+    kinds = (
+        ("path constraints", paths, h, problem.path_bounds, multipliers.path, size.path),
+        ("state bounds", states, x, problem.state_bounds, multipliers.state, size.x),
         (
-            "path constraints",
-            None,
-            jax.vmap(problem.path_constraints)(t, x, u),
-            problem.path_bounds,
+            "control bounds", problem.control_names, u, problem.control_bounds,
+            multipliers.control, size.u,
         ),
-    ):
-        lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
-        over_by = jnp.maximum(lo[None] - values, 0.0) + jnp.maximum(values - hi[None], 0.0)
-        labels = labels or [f"path {i}" for i in range(values.shape[1])]
-        rows.add(name, labels, over_by, t, tight)
+    )  # fmt: skip
+    for name, labels, values, bounds, _, of in kinds:
+        rows.add(name, labels, _overstep(values, bounds) / of[None], t, tight)
+    slack = jax.vmap(_slackness, in_axes=(0, 0, None, None))
+    signs = [slack(m, values, bounds, of) * of[None] for _, _, values, bounds, m, of in kinds]
+    signs = jnp.concatenate(signs, axis=1) / size.hamiltonian
+    labels = paths + states + problem.control_names
+    rows.add("complementarity", labels, signs, t, tight)
 
-    rows.add(
-        "complementarity",
-        tuple(f"path {i}" for i in range(multipliers.path.shape[1]))
-        + states
-        + problem.control_names,
-        _complementarity(extremal) / h_scale,
-        t,
-        tight,
-    )
+    gains = jax.vmap(jax.vmap(problem.integrands))(times, gx, gu)
+    gains = jnp.sum(quad(gains), axis=0)
+    labels = tuple(f"integral {i}" for i in range(gains.shape[0]))
+    of = _bound_size(gains, problem.integral_bounds)
+    miss = _overstep(gains, problem.integral_bounds) / of
+    rows.add("integral constraints", labels, miss[None], tf[None], tight)
+    signs = _slackness(multipliers.integral, gains, problem.integral_bounds, of) * of / size.cost
+    rows.add("complementarity, integrals", labels, signs[None], tf[None], tight)
+
+    if extremal.chosen is not None:
+        # Static parameters: the gradient of Ebar + int H bar dt vanishes, or a bound holds it.
+        def lagrangian(p: Array) -> Array:
+            other = extremal.chosen.into(problem, p)
+            ends = endpoint_lagrangian(other, multipliers.endpoint, x0, xf, t0, tf)
+            along = over(lambda _, *at: constrained_hamiltonian(other, *at))
+            return ends + jnp.sum(quad(along(times, gx, gu, glam, gheld)[..., None]))
+
+        p = extremal.chosen.values(problem)
+        of = _bound_size(p, extremal.chosen.bounds)
+        gap = _slackness(-jax.grad(lagrangian)(p), p, extremal.chosen.bounds, of) * of / size.cost
+        labels = extremal.chosen.names
+        rows.add("static parameters", labels, gap[None], tf[None], tight)
 
     # Spectral tail: the last two Legendre coefficients of each segment's polynomial.
     inverse = legendre_matrix(extremal.reference_nodes)[-2:]
-    tail = lambda v, s: (
-        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", inverse, v)), axis=1)
-        / (s if jnp.ndim(s) else s * jnp.ones(v.shape[2], v.dtype))[None]
-    )
+    tail = lambda v, of: jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", inverse, v)), axis=1) / of[None]
     rows.add(
-        "spectral tail, state", states, tail(extremal.by_segment(x), 1e-3 + span), breaks[1:], tight
+        "spectral tail, state", states, tail(extremal.by_segment(x), size.x), breaks[1:], tight
     )
-    rows.add("spectral tail, costate", costates, tail(lam_parts, lam_span), breaks[1:], tight)
+    rows.add("spectral tail, costate", costates, tail(lam_parts, size.costate), breaks[1:], tight)
     return rows.done()
 
 
-def _complementarity(extremal: Extremal) -> Float[Array, "node constraint"]:
-    """Multiplier times distance from the bound that its sign names: zero where bounds are active
-    with the right sign, or let go."""
-    problem, m = extremal.problem, extremal.multipliers
-    h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
-    over = jax.vmap(_slackness, in_axes=(0, 0, None))
-    sides = (
-        over(m.path, h, problem.path_bounds),
-        over(m.state, extremal.x, problem.state_bounds),
-        over(m.control, extremal.u, problem.control_bounds),
-    )
-    return jnp.concatenate(sides, axis=1)
-
-
-def _slackness(multiplier: Float[Array, " k"], values: Float[Array, " k"], bounds: Any) -> Array:
-    """|multiplier| times the distance from the bound that its sign names."""
+def _slackness(
+    multiplier: Float[Array, " k"], values: Float[Array, " k"], bounds: Any, size: Array
+) -> Float[Array, " k"]:
+    """|multiplier| times the distance from the bound that its sign names, in sizes: zero where a
+    bound is active with the right sign, or let go."""
     lo, hi = bounds_of(bounds, values.shape[0], values.dtype)
-    distance = jnp.where(multiplier > 0, hi - values, values - lo)
+    distance = jnp.where(multiplier > 0, hi - values, values - lo) / size
     # Beyond a size of one, as for a bound at infinity, the multiplier alone counts.
     return jnp.abs(multiplier) * jnp.clip(distance, 0.0, 1.0)
 
 
-def _cost_scale(extremal: Extremal) -> Array:
-    problem = extremal.problem
-    g = jax.grad(problem.endpoint_cost, argnums=1)(
-        extremal.x[0], extremal.x[-1], extremal.t[0], extremal.t[-1]
-    )
-    return jnp.max(jnp.abs(g))
+def _overstep(values: Float[Array, "*k c"], bounds: Any) -> Float[Array, "*k c"]:
+    """How far `values` lie outside their bounds."""
+    sides = bounds_of(bounds, values.shape[-1], values.dtype)
+    lo, hi = (jnp.broadcast_to(b, values.shape) for b in sides)
+    return jnp.maximum(lo - values, 0.0) + jnp.maximum(values - hi, 0.0)
+
+
+def _initial_bounds(problem: Problem) -> tuple[Array, Array]:
+    """Of the initial state, where it is free: its own and those of every state."""
+    lo, hi = bounds_of(problem.state_bounds, problem.n, jnp.result_type(float))
+    entries = [e if is_free(e) else Free() for e in initial_entries(problem)]
+    own = [jnp.stack([jnp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
+    return jnp.maximum(lo, own[0]), jnp.minimum(hi, own[1])
+
+
+def _bound_size(values: Float[Array, " k"], bounds: Any) -> Float[Array, " k"]:
+    """The largest of a value and its finite bounds; 1 if that is zero."""
+    both = jnp.stack([*bounds_of(bounds, values.shape[0], values.dtype), values])
+    size = jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0.0), axis=0)
+    return jnp.where(size > 0, size, 1.0)
 
 
 def _propagate(extremal: Extremal) -> Array:

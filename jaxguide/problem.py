@@ -166,6 +166,34 @@ def _follow(tree: Any, path: Path) -> Any:
     return tree
 
 
+class Chosen(eqx.Module):
+    """Static parameters that a solver chose: where a Problem holds them, and their bounds."""
+
+    paths: tuple[Path, ...] = eqx.field(static=True)
+    bounds: tuple[Array, Array]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(".".join(map(str, path)) for path in self.paths)
+
+    def values(self, problem: Problem) -> Float[Array, " k"]:
+        return jnp.stack([as_float(_follow(problem, path)) for path in self.paths])
+
+    def into(self, problem: Problem, p: Array) -> Problem:
+        """`problem` with the numbers `p` for them."""
+        where = lambda q: [_follow(q, path) for path in self.paths]
+        return eqx.tree_at(where, problem, [p[i] for i in range(len(self.paths))])
+
+
+def choices(problem: Problem) -> Chosen | None:
+    """The `Free` parameters of `problem`; None where there are none."""
+    entries = parameters(problem)
+    if not entries:
+        return None
+    side = lambda k: jnp.stack([as_float(getattr(e, k)) for e in entries])
+    return Chosen(problem.parameter_paths(), (side("lo"), side("hi")))
+
+
 def replace_parameters(problem: Problem, names: tuple[str, ...], values: Any) -> Problem:
     """`problem` with scalar fields `names` set to the entries of `values`."""
     return dataclasses.replace(problem, **{name: values[i] for i, name in enumerate(names)})

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve
-from jaxguide.problem import Problem, bounds_of, hamiltonian
+from jaxguide.problem import Chosen, Problem, bounds_of, hamiltonian
 from jaxguide.spectral import interpolate
 from jaxguide.types import RESULTS
 
@@ -125,6 +125,8 @@ class Extremal(Trajectory):
     # Whether the control is linear between breaks, its node values optimised: H_u = 0 then holds on
     # average only, and the control between nodes is the line itself.
     parametric: bool = eqx.field(static=True, default=False)
+    # Static parameters that the solver chose; `problem` holds their values.
+    chosen: Chosen | None = None
 
     def control_by_segment(self) -> Float[Array, "segment p m"]:
         """Nodal controls segment by segment, each with its own end."""

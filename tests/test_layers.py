@@ -19,6 +19,7 @@ LAYERS = (
     "spectral",
     "problem",
     "trajectory",
+    "sizes",
     "nominal",
     "neighboring",
     "certificate",

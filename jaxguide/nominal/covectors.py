@@ -14,7 +14,7 @@ from jaxguide.nominal.box import Box, boxed, distances
 from jaxguide.nominal.mesh import left_null
 from jaxguide.nominal.shooting import unwrap_angles
 from jaxguide.nominal.transcription import Bounds, Transcription, flattened, node_times
-from jaxguide.problem import Problem, with_parameters
+from jaxguide.problem import Problem, choices, with_parameters
 from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
@@ -30,7 +30,7 @@ def to_extremal(
     """User units; costates by the covector mapping theorem (eqs 23-25)."""
     size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
     dtype, n = program.dtype, size.n
-    problem = with_parameters(problem, w.p * scale.p)
+    chosen, problem = choices(problem), with_parameters(problem, w.p * scale.p)
     support = program.support(w)
     whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
     t_support = node_times(program, w, rule.support)
@@ -103,6 +103,7 @@ def to_extremal(
         degenerate=_undecided(box, solution),
         problem=problem,
         certifier=certifier,
+        chosen=chosen,
     )
 
 

@@ -174,7 +174,7 @@ class Phased(Problem):
                     x=per_state(extremal.x)[i], u=per_control(extremal.u)[i],
                     costate=per_state(extremal.costate)[i], multipliers=covectors, problem=phase,
                     u_before=per_control(extremal.u_before)[i],
-                    costate_before=per_state(extremal.costate_before)[i],
+                    costate_before=per_state(extremal.costate_before)[i], chosen=None,
                 )
             )  # fmt: skip
         return tuple(out)

@@ -20,6 +20,7 @@ from jaxguide.nominal.structure import Arcs, arcs, corrected, laid_out, without_
 from jaxguide.nominal.transcription import Arcwise
 from jaxguide.nominal.wrappers import Endless
 from jaxguide.problem import Problem
+from jaxguide.sizes import sizes_of, state_sizes
 from jaxguide.spectral import (
     differentiation_matrix,
     interpolation_matrix,
@@ -74,7 +75,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     rate = jnp.einsum("gp,spk->sgk", D, extremal.by_segment(extremal.x))
     rate = rate / jnp.where(half > 0, half, 1.0)[:, None, None]
     f = jax.vmap(jax.vmap(problem.dynamics))(times, x, u)
-    span = 1e-3 + jnp.max(jnp.abs(extremal.x), axis=0)
+    span = state_sizes(extremal)
     gap = half[:, None] * jnp.einsum("g,sgk->sk", weights, jnp.abs(rate - f))
     return jnp.max(gap / span[None], axis=1)
 
@@ -85,12 +86,12 @@ def tails(extremal: Extremal) -> Float[Array, ""]:
     by Jackson's theorem what a finer grid could still change."""
     last = legendre_matrix(extremal.reference_nodes)[-2:]
     parts = (extremal.by_segment(extremal.x), extremal.costate_by_segment())
-    spans = (1e-3 + jnp.max(jnp.abs(extremal.x), axis=0), jnp.max(jnp.abs(extremal.costate)))
-    sizes = [
-        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", last, v)) / s)
-        for v, s in zip(parts, (spans[0][None, None], spans[1] + 1e-300), strict=True)
+    size = sizes_of(extremal)
+    tails = [
+        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", last, v)) / of[None, None])
+        for v, of in zip(parts, (size.x, size.costate), strict=True)
     ]
-    return jnp.maximum(*sizes)
+    return jnp.maximum(*tails)
 
 
 def moved(

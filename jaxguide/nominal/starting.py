@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
+from jaxguide.nominal.wrappers import evened
 from jaxguide.problem import (
     Problem,
     bounds_of,
@@ -27,6 +28,7 @@ from jaxguide.problem import (
 from jaxguide.trajectory import Extremal
 
 _REST = 1e-8  # a guess below it rests at zero
+_FAR = 3  # orders of magnitude from 1 at which a size is not left at 1
 _SHARES = (0.0, -0.25, 0.25)  # of a control's range, from its middle
 
 
@@ -104,14 +106,18 @@ def straight_guess(
     u = start_control(program.problem, dtype)
     s = fractions_at(fractions, program.rule.support[1:])
     x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
-    u = jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
+    over = lambda u: jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
     p = [start_value(v) for v in parameters(program.problem)]
     times = placed(t0, tf, fractions, knots)
+    straight = without_slacks(program, x0, x, over(u), times, p)
+    unbounded = jnp.isinf(jnp.stack(bounds_of(problem.control_bounds, size.m, dtype))).any(axis=0)
+    middle = jnp.clip(0.0, *bounds_of(problem.control_bounds, size.m, dtype))
+    u = jnp.where(unbounded, middle + (u - middle) * sizes(program.problem, straight)[1], u)
     ends_at = lambda xf: problem.endpoint_constraints(x0, xf, t0, tf)
     unasked = ~jnp.any(jax.jacfwd(ends_at)(xf) != 0, axis=0) if q else jnp.ones(n, bool)
     rests = unasked & (jnp.abs(x0) < _REST) & (jnp.abs(xf) < _REST)
     rests = rests & ~jnp.asarray(initially_free(program.problem))
-    return propagated(program, without_slacks(program, x0, x, u, times, p), rests)
+    return propagated(program, straight._replace(u=over(u)), rests)
 
 
 def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> Primal:
@@ -289,38 +295,83 @@ def duals(
 
 def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
     """The larger finite bound; else the largest value seen; else 1."""
+    said = _said(lo, hi, seen)
+    return jnp.where(said > 0, said, 1.0)
+
+
+def _said(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
+    """The larger finite bound; else the largest value seen, unless it is at rest; else 0."""
     bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
     wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
-    scale = jnp.where(bounded & (wide > 0), wide, jnp.max(jnp.abs(seen), axis=0))
-    return jnp.where(scale > 1e-8, scale, 1.0)
+    largest = jnp.max(jnp.abs(seen), axis=0)
+    return jnp.where(wide > 0, wide, jnp.where(largest > _REST, largest, 0.0))
+
+
+@jax.jit
+def sizes(problem: Problem, w: Primal) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """What a state and a control amount to, in user units: by their bounds or values; where nothing
+    is said, 1, unless the dynamics tell that their size is another by far.
+
+    They tell of one unknown from its neighbours: what moves a state of known size by as much within
+    the horizon, or how far a state is moved by what is known.
+    """
+    n, m, dtype = problem.n, problem.m, w.x.dtype
+    seen = jnp.concatenate([w.x0[None], w.x.reshape(-1, n)])
+    x = _said(*bounds_of(problem.state_bounds, n, dtype), seen)
+    u = _said(*bounds_of(problem.control_bounds, m, dtype), jnp.zeros((1, m), dtype))
+    known = jnp.concatenate([x, u])
+    # Small numbers alone are better than nothing.
+    small = jnp.concatenate([jnp.max(jnp.abs(seen), axis=0), jnp.zeros(m, dtype)])
+    known = jnp.where(jnp.any(known > 0), known, small)
+    rate = jax.jacfwd(with_parameters(problem, None).dynamics, argnums=(1, 2))
+    ends = w.x[:, -1]
+    at = jnp.concatenate(rate(w.times[0], w.x0, w.u[0, 0]), axis=1)[None]
+    along = jax.vmap(rate, in_axes=(None, 0, 0))((w.times[0] + w.times[1]) / 2, ends, w.u[:, -1])
+    moves = jnp.concatenate([at, jnp.concatenate(along, axis=2)])
+    moves = jnp.max(jnp.where(jnp.isfinite(moves), jnp.abs(moves), 0.0), axis=0)
+    moves = moves * (w.times[1] - w.times[0])
+
+    def tell(_: Any, size: Array) -> Array:
+        mover = jnp.where((size[:n, None] > 0) & (moves > 0), size[:n, None] / moves, jnp.inf)
+        mover = jnp.min(mover, axis=0)
+        moved = jnp.pad(jnp.max(moves * size[None], axis=1), (0, m))
+        told = jnp.where(jnp.isfinite(mover), mover, moved)
+        return jnp.where(size > 0, size, told)
+
+    told = jax.lax.fori_loop(0, n + m, tell, known)
+    far = (told > 0) & (jnp.abs(jnp.log10(jnp.where(told > 0, told, 1.0))) > _FAR)
+    size = jnp.where(known > 0, known, jnp.where(far, told, 1.0))
+    return size[:n], size[n:]
 
 
 def designer_units(program: Transcription, w: Primal) -> Scale:
     """Scales from bounds and the guess; constraints and objective by their gradients there."""
-    problem, size, dtype = program.problem, program.sizes, program.dtype
-    x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
-    u_lo, u_hi = bounds_of(problem.control_bounds, size.m, dtype)
-    x = typical(x_lo, x_hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
-    u = typical(u_lo, u_hi, jnp.zeros((1, size.m), dtype))
-    t = jnp.maximum(w.times[1] - w.times[0], 1e-8)
+    problem, size, dtype = evened(program.problem), program.sizes, program.dtype
+    program = eqx.tree_at(lambda q: q.problem, program, problem)
+    x, u = sizes(problem, w)
+    span = w.times[1] - w.times[0]
+    t = jnp.where(span > 0, span, 1.0)
     p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)
     scale = program.scale._replace(x=x, u=u, t=t, p=p)
     program = eqx.tree_at(lambda q: q.scale, program, scale)
     scaled = jax.tree_util.tree_map(jnp.divide, w, program.units)
-    nodes, ends = program.derivatives(scaled)
-    n = size.n
-    rows = jnp.max(jnp.abs(nodes.jacobian), axis=(0, 1, 3), initial=0.0)
-    usable = lambda a: jnp.where(jnp.isfinite(a) & (a > 1e-8), a, 1.0)
-    # The objective's gradient a unit away too: at rest it may vanish.
+    # A unit away too: at rest a gradient may vanish.
     away = scaled._replace(x=scaled.x + 1.0, u=scaled.u + 1.0)
-    steeper, _ = program.derivatives(away)
-    weights = jnp.asarray(program.rule.w, dtype)[None, :, None]
-    largest = lambda a: jnp.max(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0))
-    cost = jnp.maximum(
-        largest(nodes.jacobian[:, :, n] / weights), largest(steeper.jacobian[:, :, n] / weights)
+    n, weights = size.n, jnp.asarray(program.rule.w, dtype)[None, :, None]
+    largest = lambda a, axis: jnp.max(
+        jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0), axis=axis, initial=0.0
     )
-    end_rows = jnp.max(jnp.abs(ends.jacobian), axis=1)
-    objective = usable(jnp.maximum(cost, end_rows[0]))
-    end = usable(end_rows[1:])
+
+    def slopes(w: Primal) -> tuple[Array, Array, Array]:
+        """Of path constraints, endpoint cost and constraints, and running cost."""
+        nodes, ends = program.derivatives(w)
+        path = largest(nodes.jacobian[:, :, n + 1 :], (0, 1, 3))
+        return path, largest(ends.jacobian, 1), largest(nodes.jacobian[:, :, n] / weights, None)
+
+    here, there = slopes(scaled), slopes(away)
+    path, end = (jnp.where(a > _REST * b, a, b) for a, b in zip(here[:2], there[:2], strict=True))
+    usable = lambda a: jnp.where(a > 0, a, 1.0)
+    objective = usable(jnp.maximum(jnp.maximum(here[2], there[2]), here[1][0]))
+    end = usable(end[1:])
     end = end.at[size.end - len(program.order) :].set(1.0)  # of the knots: in units of time
-    return scale._replace(path=usable(rows[n + 1 :]), end=end, objective=objective)
+    return scale._replace(path=usable(path), end=end, objective=objective)

@@ -3,13 +3,22 @@ horizon brought to a finite one. Each adds states or controls after those of the
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.problem import Problem, bounds_of, count, endpoint_count, initial_entries
+from jaxguide.problem import (
+    Chosen,
+    Path,
+    Problem,
+    bounds_of,
+    count,
+    endpoint_count,
+    initial_entries,
+)
 from jaxguide.trajectory import Extremal, Multipliers
 
 
@@ -149,11 +158,13 @@ class Endless(Wrapped):
     scale: Float[Array, ""]
     start: Float[Array, ""]
     at_rest: bool = eqx.field(static=True)
+    even: bool = eqx.field(static=True, default=False)  # rates as at the start, all along
 
     def clock(self, s: Any) -> tuple[Any, Any]:
         """t and dt/ds; at s = 1, where nothing moves any more, a rate of zero."""
         left = jnp.where(s < 1, 1 - s, 1.0)
         rate = jnp.where(s < 1, 2 * self.scale / left**2, 0.0)
+        rate = jnp.full_like(rate, self.scale / 2) if self.even else rate
         return self.start + self.scale * (1 + s) / left, rate
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
@@ -199,6 +210,15 @@ def endless(problem: Problem, scale: Any) -> Problem:
     )
 
 
+def evened(problem: Problem) -> Problem:
+    """`problem`, an endless horizon's clock running evenly: of the size that counts, where near the
+    end rates grow beyond all bounds."""
+    if not isinstance(problem, Wrapped):
+        return problem
+    changed: dict[str, Any] = {"even": True} if isinstance(problem, Endless) else {}
+    return dataclasses.replace(problem, inner=evened(problem.inner), **changed)
+
+
 def opened(extremal: Extremal) -> Extremal:
     """An extremal of an `Endless` problem, in the user's time: its last node is at t = inf."""
     problem: Any = extremal.problem
@@ -215,6 +235,7 @@ def opened(extremal: Extremal) -> Extremal:
         multipliers=Multipliers(nu, *nodal, m.integral),
         problem=problem.inner,
         stretch=problem.scale,
+        chosen=_rerooted(extremal.chosen, lambda path: path[1:]),
     )
     return out
 
@@ -234,4 +255,9 @@ def closed(extremal: Extremal) -> Extremal:
         multipliers=Multipliers(nu, m.path * rate, m.state * rate, m.control * rate, m.integral),
         problem=problem,
         stretch=None,
+        chosen=_rerooted(extremal.chosen, lambda path: ("inner", *path)),
     )
+
+
+def _rerooted(chosen: Chosen | None, along: Callable[[Path], Path]) -> Chosen | None:
+    return chosen and Chosen(tuple(map(along, chosen.paths)), chosen.bounds)
