@@ -1,0 +1,97 @@
+"""How large each quantity of an extremal is: what errors are relative to, in any units."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.problem import bounds_of
+from jaxguide.trajectory import Extremal
+
+# A state below this share of what the others would move it by is at rest: its size is `_MOVED` of
+# that.
+_REST, _MOVED = 1e-6, 1e-3
+_TERMS = 1e-3  # of the terms of H, where they cancel
+
+
+class Sizes(NamedTuple):
+    """In user units, all above zero."""
+
+    x: Float[Array, " n"]
+    u: Float[Array, " m"]
+    t: Float[Array, ""]  # the horizon
+    cost: Float[Array, ""]  # what states and costates together are worth
+    hamiltonian: Float[Array, ""]
+    path: Float[Array, " p"]
+    end: Float[Array, " q"]
+
+    @property
+    def costate(self) -> Float[Array, " n"]:
+        return self.cost / self.x
+
+
+def sizes_of(extremal: Extremal) -> Sizes:
+    """Of a state the largest value, or where it rests what the others would move it by; of
+    constraints what a change of everything by its size amounts to, or a bound."""
+    problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
+    horizon = t[-1] - t[0]
+    u_size = jnp.maximum(jnp.max(jnp.abs(u), axis=0), _finite(problem.control_bounds, problem.m))
+    u_size = _positive(u_size)
+    x_size = state_sizes(extremal)
+    z = jnp.concatenate([x_size, u_size])
+    along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))
+    path = jnp.max(_known(along(problem.path_constraints)) @ z, axis=0, initial=0.0)
+    path = jnp.maximum(path, _finite(problem.path_bounds, path.shape[0]))
+
+    ends = (x[0], x[-1], t[0], t[-1])
+    of_ends = lambda f: jnp.concatenate(
+        [jnp.atleast_2d(j.T).T for j in jax.jacfwd(f, argnums=(0, 1, 2, 3))(*ends)], axis=-1
+    )
+    moves = jnp.concatenate([x_size, x_size, horizon[None], horizon[None]])
+    end = _known(of_ends(problem.endpoint_constraints)) @ moves
+    end = jnp.maximum(end, _finite(problem.endpoint_bounds, end.shape[0]))
+
+    worth = jnp.max(jnp.max(jnp.abs(extremal.costate), axis=0) * x_size)
+    e_x = jax.grad(problem.endpoint_cost, argnums=1)(*ends)
+    cost = _positive(worth + jnp.max(jnp.abs(e_x) * x_size))
+
+    f = jax.vmap(problem.dynamics)(t, x, u)
+    F = jax.vmap(problem.running_cost)(t, x, u)
+    gain = jax.vmap(problem.integrands)(t, x, u) @ extremal.multipliers.integral
+    H = F + gain + jnp.sum(extremal.costate * f, axis=1)
+    terms = jnp.abs(F) + jnp.sum(jnp.abs(extremal.costate * f), axis=1)
+    hamiltonian = _positive(jnp.max(jnp.abs(H)) + _TERMS * jnp.max(terms))
+    return Sizes(x_size, u_size, horizon, cost, hamiltonian, _positive(path), _positive(end))
+
+
+def state_sizes(extremal: Extremal) -> Float[Array, " n"]:
+    problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
+    span, most = jnp.max(jnp.abs(x), axis=0), jnp.max(jnp.abs(u), axis=0)
+    slopes = jax.vmap(jax.jacfwd(_joined(problem.dynamics, problem.n), argnums=1))(t, _stack(x, u))
+    moved = _known(slopes) @ jnp.concatenate([span, most])
+    # The median: at the end of an infinite horizon rates grow beyond all bounds.
+    moved = (t[-1] - t[0]) * jnp.median(moved, axis=0)
+    return _positive(jnp.where(span >= _REST * moved, span, _MOVED * moved))
+
+
+def _joined(f: Any, n: int) -> Any:
+    return lambda t, z: f(t, z[:n], z[n:])
+
+
+def _stack(x: Array, u: Array) -> Array:
+    return jnp.concatenate([x, u], axis=1)
+
+
+def _known(slopes: Array) -> Array:
+    return jnp.where(jnp.isfinite(slopes), jnp.abs(slopes), 0.0)
+
+
+def _finite(bounds: Any, k: int) -> Float[Array, " k"]:
+    """The larger finite bound, or 0."""
+    both = jnp.stack(bounds_of(bounds, k, jnp.result_type(float)))
+    return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0.0), axis=0)
+
+
+def _positive(size: Array) -> Array:
+    return jnp.where(size > 0, size, 1.0)
