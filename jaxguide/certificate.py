@@ -301,10 +301,10 @@ def _checks(extremal: Extremal, costly: bool, tight: float) -> Certificate:
     labels = paths + states + problem.control_names
     rows.add("complementarity", labels, signs, t, tight)
 
-    gains = jax.vmap(jax.vmap(problem.integrands))(times, gx, gu)
-    gains = jnp.sum(quad(gains), axis=0)
+    each = jax.vmap(jax.vmap(problem.integrands))(times, gx, gu)
+    gains = jnp.sum(quad(each), axis=0)
     labels = tuple(f"integral {i}" for i in range(gains.shape[0]))
-    of = _bound_size(gains, problem.integral_bounds)
+    of = _bound_size(jnp.sum(quad(jnp.abs(each)), axis=0), problem.integral_bounds)
     miss = _overstep(gains, problem.integral_bounds) / of
     rows.add("integral constraints", labels, miss[None], tf[None], tight)
     signs = _slackness(multipliers.integral, gains, problem.integral_bounds, of) * of / size.cost

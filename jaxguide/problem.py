@@ -113,6 +113,9 @@ class Problem(eqx.Module):
         """Optional closed form of H_u = 0 with H minimised, shape (m,); None: solved by Newton."""
         return None
 
+    def check_statement(self) -> None:
+        """Refuses, with a `ValueError`, what a kind of Problem knows to be badly stated."""
+
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
         """Where a `Free` static parameter is held, for the solver to choose."""
         return tuple(
@@ -366,6 +369,23 @@ def _check_start(problem: Problem, x0: Any) -> None:
             )
 
 
+def check_initial_state(problem: Problem) -> None:
+    """Refuses initial entries that are not one a state."""
+    kind, n = type(problem).__name__, problem.n
+    entries = problem.initial_state
+    if entries is not None and not is_free(entries):
+        if not isinstance(entries, (tuple, list)) and jnp.ndim(entries) != 1:
+            raise ValueError(
+                f"{kind}.initial_state is {entries!r}; give one entry for each of the {n} states "
+                f"{problem.state_names}."
+            )
+        size = len(entries) if isinstance(entries, (tuple, list)) else jnp.shape(entries)[0]
+        if size != n:
+            raise ValueError(
+                f"{kind}.initial_state has {size} entries for {n} states {problem.state_names}."
+            )
+
+
 def validate(problem: Problem) -> None:
     """Refuses a badly stated problem, naming the field, its value and the remedy.
 
@@ -381,20 +401,10 @@ def validate(problem: Problem) -> None:
     kind = type(problem).__name__
     _check_names(problem, "state_names")
     _check_names(problem, "control_names")
+    problem.check_statement()
     n, m = problem.n, problem.m
     dtype = jnp.result_type(float)
-    entries = problem.initial_state
-    if entries is not None and not is_free(entries):
-        if not isinstance(entries, (tuple, list)) and jnp.ndim(entries) != 1:
-            raise ValueError(
-                f"{kind}.initial_state is {entries!r}; give one entry for each of the {n} states "
-                f"{problem.state_names}."
-            )
-        size = len(entries) if isinstance(entries, (tuple, list)) else jnp.shape(entries)[0]
-        if size != n:
-            raise ValueError(
-                f"{kind}.initial_state has {size} entries for {n} states {problem.state_names}."
-            )
+    check_initial_state(problem)
     t = jax.ShapeDtypeStruct((), dtype)
     x, u = jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype)
     _shape(problem, "dynamics", (n,), t, x, u)

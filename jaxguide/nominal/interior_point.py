@@ -54,6 +54,7 @@ _HALVINGS, _FILTER = 30, 128
 # iterates, and stays above `_AHEAD` of that error. Chosen by experiment: free from the start, or
 # where the problem is not convex, NPSAT1 took three times the iterations.
 _NEAR, _FALL, _MEMORY, _MU_MAX, _AHEAD = 1e-3, 0.9999, 4, 1e2, 1e-4
+_SHRINK = 0.5  # of the horizon, that a step may take away
 _MULTIPLIERS_MAX = 1e3  # of the first estimate; a larger one is worth less than none
 
 # Kinds of pass through the loop.
@@ -265,6 +266,15 @@ def _evaluated(program: Transcription, box: Box, s: _State) -> _Here:
     return _Here(nodes, ends, f, c, low, high, error)
 
 
+def _patient(program: Transcription, w: Array, d: Array) -> Array:
+    """The longest step by which the horizon loses no more than `_SHRINK` of itself: a model that is
+    linear in time would throw most of it away, from guesses that stand still."""
+    now, more = (program.shaped(a).times for a in (w, d))
+    horizon, change = now[1] - now[0], more[1] - more[0]
+    shrinks = (change < 0) & (horizon > 0)
+    return jnp.minimum(1.0, jnp.where(shrinks, -_SHRINK * horizon / change, 1.0))
+
+
 def _step(
     program: Transcription, box: Box, options: Options, s: _State, at: _Here, error_now: Array
 ) -> tuple[_State, Array, Array]:
@@ -383,7 +393,9 @@ def _step(
         right = load(target, jnp.where(probe, 0.0, mu))
         solved = kkt.solve(program, system, segments, factor, right)
         step = _Move(flattened(solved.primal), solved.dual)
-        length = longest_step(low, high, step.primal, box, tau)
+        length = jnp.minimum(
+            longest_step(low, high, step.primal, box, tau), _patient(program, s.w, step.primal)
+        )
         first = _where(k == 0, (step, length), first)
         ok, f_type, c_new, theta_new = judge(
             mu, first[1], slope_of(mu, first[0].primal), step.primal, length

@@ -1,19 +1,22 @@
 """`jg.Phased`: problems one after another, linked, as one Problem on a common clock."""
 
 import dataclasses
-import math
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxguide.nominal.wrappers import Wrapped, own_fields
 from jaxguide.problem import (
     Free,
     Problem,
     bounds_of,
+    check_initial_state,
     count,
     endpoint_count,
     initial_entries,
@@ -33,6 +36,13 @@ class PhaseEnds(NamedTuple):
     tf: Float[Array, ""]
 
 
+class Linked(Wrapped):
+    """A phase whose end is given by what follows it."""
+
+    def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        return xf
+
+
 class Phased(Problem):
     """Phases that follow each other in time, each with dynamics, bounds, costs and constraints of
     its own: staging, a rocket's arcs, anything with a jump of the state.
@@ -43,47 +53,111 @@ class Phased(Problem):
     **Arguments:** `phases`: Problems; each starts when the one before ends, at its `final_time` (a
     number or `jg.Free`), and only the first one's `initial_time` counts. States of later phases
     are free at their start unless their `initial_state` says otherwise. `links(ends)`: what must
-    vanish, (r,), from one `PhaseEnds` a phase; default: the state is continuous.
+    vanish, (r,), from one `PhaseEnds` a phase; default: the state is continuous. A function, or an
+    `equinox.Module` whose leaves (the jump, say) are then differentiable.
 
-    **Raises:** `ValueError` if phases that should be continuous have other states, or a phase has
-    no end.
+    Names, bounds and initial entries are those of the phases: edit them there, by
+    `equinox.tree_at` or with new phases.
+
+    **Raises:** `ValueError` if phases that should be continuous have other states, times do not
+    ascend, or a phase has no end.
     """
 
     phases: tuple[Problem, ...]
-    links: Callable[[tuple[PhaseEnds, ...]], Any] | None = eqx.field(static=True)
+    links: Any
 
-    def __init__(self, phases: Any, links: Any = None, **derived: Any):
-        # `derived` holds what dataclasses.replace passes on: computed from the phases anew.
-        del derived
+    def __init__(self, phases: Any, links: Any = None):
         self.phases = phases = tuple(phases)
-        self.links = links
+        plain = links is not None and not isinstance(links, (eqx.Module, jax.tree_util.Partial))
+        self.links = jax.tree_util.Partial(links) if plain else links
+        self.check_statement()
+
+    def check_statement(self) -> None:
+        """Refuses phases that cannot follow each other. Also asked by `solve`."""
+        phases, links = self.phases, self.links
         if len(phases) < 2:
             raise ValueError(f"Phased: {len(phases)} phases; give at least two.")
+        for i, phase in enumerate(phases):
+            check_initial_state(phase)
+            tf = phase.final_time
+            if not is_free(tf) and not is_traced(tf) and np.any(np.isinf(np.asarray(tf))):
+                raise ValueError(
+                    f"Phased: {type(phase).__name__}.final_time is infinite; give an end."
+                )
+            a, b = self.horizons()[i]
+            earliest, latest = a.lo if is_free(a) else a, b.hi if is_free(b) else b
+            if not is_traced((earliest, latest)) and not float(latest) > float(earliest):
+                raise ValueError(
+                    f"Phased: phase {i + 1}, {type(phase).__name__}, starts at {_said(a)} and ends "
+                    f"at {_said(b)}; times must ascend. A phase starts at the final_time of the "
+                    "one before."
+                )
         for a, b in zip(phases[:-1], phases[1:], strict=True):
             if links is None and a.state_names != b.state_names:
                 raise ValueError(
                     f"Phased: {type(a).__name__} has states {a.state_names} and "
                     f"{type(b).__name__} has {b.state_names}; say in `links` how they join."
                 )
-        named = lambda of: tuple(f"{i + 1}:{k}" for i, p in enumerate(phases) for k in of(p))
-        self.state_names = named(lambda p: p.state_names)
-        self.control_names = named(lambda p: p.control_names)
-        self.initial_time, self.final_time = 0.0, 1.0
-        self.initial_state = _starts(phases)
+        function = getattr(links, "func", None)
+        if inspect.isfunction(function) and is_traced(
+            list(inspect.getclosurevars(function).nonlocals.values())
+        ):
+            raise ValueError(
+                f"Phased: links {function.__name__!r} closes over a traced number. Make it a field "
+                "of an equinox.Module with __call__(self, ends), and give that as `links`."
+            )
+
+    def _named(self, of: Callable[[Problem], tuple[str, ...]]) -> tuple[str, ...]:
+        return tuple(f"{i + 1}:{k}" for i, p in enumerate(self.phases) for k in of(p))
+
+    def _joined(self, name: str, sizes: list[int]) -> tuple[Array, Array]:
+        """Bounds `name` of all phases."""
+        each = zip(self.phases, sizes, strict=True)
         dtype = jnp.result_type(float)
-        sizes = lambda name: [count(p, name) for p in phases]
-        join = lambda name, k: _join(
-            [bounds_of(getattr(p, name), n, dtype) for p, n in zip(phases, k, strict=True)]
-        )
-        self.state_bounds = join("state_bounds", [p.n for p in phases])
-        self.control_bounds = join("control_bounds", [p.m for p in phases])
-        self.path_bounds = join("path_bounds", sizes("path_constraints"))
-        self.integral_bounds = join("integral_bounds", sizes("integrands"))
-        own = join("endpoint_bounds", [endpoint_count(p) for p in phases])
-        zero = jnp.zeros(self._links(_blank_ends(phases)).shape[0], dtype)
-        last = jnp.full(len(phases), jnp.inf, dtype)
-        durations = (jnp.zeros_like(last), last)
-        self.endpoint_bounds = _join([own, (zero, zero), durations])
+        return _join([bounds_of(getattr(p, name), n, dtype) for p, n in each])
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return self._named(lambda p: p.state_names)
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        return self._named(lambda p: p.control_names)
+
+    @property
+    def initial_time(self) -> float:
+        return 0.0
+
+    @property
+    def final_time(self) -> float:
+        return 1.0
+
+    @property
+    def initial_state(self) -> tuple[Any, ...]:
+        return _starts(self.phases)
+
+    @property
+    def state_bounds(self) -> tuple[Array, Array]:
+        return self._joined("state_bounds", [p.n for p in self.phases])
+
+    @property
+    def control_bounds(self) -> tuple[Array, Array]:
+        return self._joined("control_bounds", [p.m for p in self.phases])
+
+    @property
+    def path_bounds(self) -> tuple[Array, Array]:
+        return self._joined("path_bounds", [count(p, "path_constraints") for p in self.phases])
+
+    @property
+    def integral_bounds(self) -> tuple[Array, Array]:
+        return self._joined("integral_bounds", [count(p, "integrands") for p in self.phases])
+
+    @property
+    def endpoint_bounds(self) -> tuple[Array, Array]:
+        own = self._joined("endpoint_bounds", [endpoint_count(p) for p in self.phases])
+        zero = jnp.zeros(self._links_count(), own[0].dtype)
+        last = jnp.full(len(self.phases), jnp.inf, own[0].dtype)
+        return _join([own, (zero, zero), (jnp.zeros_like(last), last)])
 
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
         paths: list[tuple[str | int, ...]] = []
@@ -132,6 +206,11 @@ class Phased(Problem):
             return jnp.atleast_1d(self.links(ends))
         return jnp.concatenate([b.x0 - a.xf for a, b in zip(ends[:-1], ends[1:], strict=True)])
 
+    def _links_count(self) -> int:
+        number = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+        ends = tuple(PhaseEnds(number(p.n), number(p.n), number(), number()) for p in self.phases)
+        return jax.eval_shape(lambda ends: self._links(ends), ends).shape[0]
+
     def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
         ends = self._ends(x0, xf)
         return sum(p.endpoint_cost(*end) for p, end in zip(self.phases, ends, strict=True))
@@ -144,7 +223,8 @@ class Phased(Problem):
         return jnp.concatenate([*own, self._links(ends), durations])
 
     def split(self, extremal: Extremal) -> tuple[Extremal, ...]:
-        """The phases' own extremals, each in its own time. Durations must be positive."""
+        """The phases' own extremals, each in its own time, from and (but for the last) to the
+        states it has at its ends: `Linked`. Durations must be positive."""
         problem = extremal.problem
         assert isinstance(problem, Phased)
         per_state = lambda y: problem.split_state(y) if y is not None else [None] * len(self.phases)
@@ -164,15 +244,20 @@ class Phased(Problem):
                 nu[i], path[i] / span, per_state(m.state)[i] / span,
                 per_control(m.control)[i] / span, integral[i],
             )  # fmt: skip
-            start = problem.split_state(extremal.x)[i][0]
+            x, costate = per_state(extremal.x)[i], per_state(extremal.costate)[i]
             phase = dataclasses.replace(
-                phase, initial_time=t0, final_time=tf, initial_state=tuple(start)
+                phase, initial_time=t0, final_time=tf, initial_state=tuple(x[0])
             )
+            if i + 1 < len(problem.phases):
+                # What follows pulls at its end as much as if its state were given there.
+                pull = jax.grad(phase.endpoint_cost, argnums=1)(x[0], x[-1], t0, tf)
+                covectors = dataclasses.replace(covectors, endpoint=costate[-1] - pull)
+                phase = Linked(phase, **own_fields(phase, endpoint_bounds=(x[-1], x[-1])))
             out.append(
                 dataclasses.replace(
                     extremal, t=t0 + span * extremal.t, final_time=jnp.asarray(tf),
-                    x=per_state(extremal.x)[i], u=per_control(extremal.u)[i],
-                    costate=per_state(extremal.costate)[i], multipliers=covectors, problem=phase,
+                    x=x, u=per_control(extremal.u)[i],
+                    costate=costate, multipliers=covectors, problem=phase,
                     u_before=per_control(extremal.u_before)[i],
                     costate_before=per_state(extremal.costate_before)[i], chosen=None,
                 )
@@ -197,10 +282,10 @@ def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
     return tuple(out)
 
 
-def _blank_ends(phases: tuple[Problem, ...]) -> tuple[PhaseEnds, ...]:
-    for phase in phases:
-        tf = phase.final_time
-        if not is_free(tf) and not is_traced(tf) and math.isinf(float(tf)):
-            raise ValueError(f"Phased: {type(phase).__name__}.final_time is infinite; give an end.")
-    zero = jnp.zeros((), jnp.result_type(float))
-    return tuple(PhaseEnds(jnp.zeros(p.n), jnp.zeros(p.n), zero, zero) for p in phases)
+def _said(time: Any) -> str:
+    return f"[{time.lo}, {time.hi}]" if is_free(time) else str(time)
+
+
+# What follows from the phases is no field: dataclasses.replace may not set it.
+for _name in own_fields(Problem):
+    del Phased.__dataclass_fields__[_name]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.linalg import solve as small_solve
-from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
+from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription, ordered
 from jaxguide.nominal.wrappers import evened
 from jaxguide.problem import (
     Problem,
@@ -47,7 +47,7 @@ def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Arr
 
 def unit_scale(problem: Problem, knots: int) -> Scale:
     path, end = count(problem, "path_constraints"), endpoint_count(problem)
-    end += knots + 1 if knots else 0
+    end += len(ordered(problem, 2 + knots))
     one = jnp.ones((), jnp.result_type(float))
     many = lambda k: jnp.ones(k, one.dtype)
     return Scale(
@@ -59,13 +59,24 @@ def unit_scale(problem: Problem, knots: int) -> Scale:
 def horizon_guess(problem: Problem) -> tuple[Array, Array]:
     """Times to start from: given, guessed, or one unit where nothing is said."""
     dtype = jnp.result_type(float)
-    t0 = jnp.asarray(start_value(problem.initial_time), dtype)
-    tf = problem.final_time
-    if not is_free(tf) or tf.guess is not None:
-        return t0, jnp.asarray(start_value(tf), dtype)
-    lo, hi = jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype)
-    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
-    return t0, jnp.where(bounded, start_value(tf), jnp.clip(t0 + 1.0, lo, hi))
+    number = lambda v: jnp.asarray(v, dtype)
+    start, end = problem.initial_time, problem.final_time
+    t0 = number(start_value(start))
+    if not is_free(end) or end.guess is not None:
+        tf = number(start_value(end))
+    else:
+        lo, hi = number(end.lo), number(end.hi)
+        bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+        tf = jnp.where(bounded, start_value(end), jnp.clip(t0 + 1.0, lo, hi))
+    # What nobody gave makes way.
+    unsaid = lambda entry: is_free(entry) and entry.guess is None
+    halfway = lambda a, b, other: jnp.where(jnp.isfinite(b), (a + b) / 2, other)
+    if unsaid(end):
+        tf = jnp.where(tf > t0, tf, halfway(t0, number(end.hi), t0 + 1.0))
+    if unsaid(start):
+        early = t0 >= (halfway(number(start.lo), tf, tf) if unsaid(end) else tf)
+        t0 = jnp.where(early, halfway(tf, number(start.lo), tf - 1.0), t0)
+    return t0, tf
 
 
 def straight_guess(

@@ -163,10 +163,7 @@ class Transcription(eqx.Module):
 
     @property
     def order(self) -> Float[np.ndarray, "row clock"]:
-        """Differences of successive times, which free knots must keep above zero."""
-        count = self.edges.shape[1]
-        sequence = np.eye(count)[[0, *range(2, count), 1]]
-        return np.diff(sequence, axis=0) if count > 2 else np.zeros((0, count))
+        return ordered(self.problem, self.edges.shape[1])
 
     @property
     def units(self) -> Primal:
@@ -299,6 +296,14 @@ def hessian(f: Any, argnum: int) -> Any:
     return symmetric
 
 
+def ordered(problem: Problem, clocks: int) -> Float[np.ndarray, "row clock"]:
+    """Differences of successive times, which must stay above zero: where knots are free, or both
+    ends. (Of one free end its bounds see to that.)"""
+    sequence = np.eye(clocks)[[0, *range(2, clocks), 1]]
+    free = is_free(problem.initial_time) and is_free(problem.final_time)
+    return np.diff(sequence, axis=0) if clocks > 2 or free else np.zeros((0, clocks))
+
+
 class Bounds(NamedTuple):
     """Of every entry of a Primal; equal where an entry is given."""
 
@@ -333,6 +338,10 @@ def bounds(program: Transcription) -> Bounds:
             tighter = jnp.maximum if i == 0 else jnp.minimum
             x0[i] = jnp.where(free, tighter(own, states[i]), start)
     times = [scalar(problem.initial_time), scalar(problem.final_time)]
+    if is_free(problem.final_time) and not is_free(problem.initial_time):
+        times[1] = (jnp.maximum(times[1][0], times[0][0]), times[1][1])
+    if is_free(problem.initial_time) and not is_free(problem.final_time):
+        times[0] = (times[0][0], jnp.minimum(times[0][1], times[1][0]))
     times += [(number(-jnp.inf), number(jnp.inf))] * (size.times - 2)
     p = [scalar(v) for v in parameters(problem)]
     controls = bounds_of(problem.control_bounds, size.m, dtype)

@@ -55,7 +55,7 @@ _FIELDS = (
 )  # fmt: skip
 
 
-def _of(problem: Problem, **changed: Any) -> dict[str, Any]:
+def own_fields(problem: Problem, **changed: Any) -> dict[str, Any]:
     """The fields of a Problem around `problem`: its own, but for those `changed`."""
     return {name: getattr(problem, name) for name in _FIELDS} | changed
 
@@ -109,7 +109,7 @@ def with_integrals(problem: Problem) -> Problem:
     states = bounds_of(problem.state_bounds, problem.n, dtype)
     return WithIntegrals(
         inner=problem,
-        **_of(
+        **own_fields(
             problem,
             state_names=problem.state_names + tuple(f"integral {i}" for i in range(r)),
             initial_state=(*initial_entries(problem), *(jnp.zeros((), dtype),) * r),
@@ -141,7 +141,7 @@ def relaxed(problem: Problem, delta: Float[Array, " n"]) -> Problem:
     own = bounds_of(problem.control_bounds, problem.m, delta.dtype)
     return Relaxed(
         inner=problem,
-        **_of(
+        **own_fields(
             problem,
             control_names=problem.control_names + tuple(f"slack {s}" for s in problem.state_names),
             control_bounds=_joined(own, (-delta, delta)),
@@ -201,7 +201,7 @@ def endless(problem: Problem, scale: Any) -> Problem:
         scale=jnp.asarray(scale, dtype),
         start=jnp.asarray(problem.initial_time, dtype),
         at_rest=at_rest,
-        **_of(
+        **own_fields(
             problem,
             initial_time=jnp.asarray(-1.0, dtype),
             final_time=jnp.asarray(1.0, dtype),

@@ -90,6 +90,18 @@ def orbit() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.sqrt(_GRAVITY * a * (1 - e * e)) * frame[:, 2], frame[:, 0], frame[:, 1]
 
 
+def staging(ends: tuple[PhaseEnds, ...]) -> Any:
+    """The state goes on, less what is dropped."""
+    dry = lambda part, count: count * (part[0] - part[1])
+    dropped = (dry(_BOOSTER, 6), dry(_BOOSTER, 3), dry(_FIRST, 1))
+    return jnp.concatenate(
+        [
+            b.x0 - a.xf.at[6].add(-mass)
+            for a, b, mass in zip(ends[:-1], ends[1:], dropped, strict=True)
+        ]
+    )
+
+
 class DeltaIII(Phased):
     """The most mass in a transfer orbit by a Delta III, in four stages: six boosters, three, none,
     and the second stage.
@@ -105,8 +117,8 @@ class DeltaIII(Phased):
         -7529.712287, 2e-6, "another pseudospectral code", "Rao et al. (2010), section 6.3"
     )
 
-    def __init__(self, phases: Any = None, links: Any = None, **derived: Any):
-        super().__init__(stages() if phases is None else phases, staging, **derived)
+    def __init__(self, phases: Any = None, links: Any = staging):
+        super().__init__(stages() if phases is None else phases, links)
 
 
 def _box(heaviest: float) -> tuple:
@@ -149,15 +161,3 @@ def stages(density: float = 1.225) -> tuple[Stage, ...]:
             state_bounds=_box(dry), final_time=Free(_FIRST[3] + 1.0, _FIRST[3] + _SECOND[3], 900.0),
         ),
     )  # fmt: skip
-
-
-def staging(ends: tuple[PhaseEnds, ...]) -> Any:
-    """The state goes on, less what is dropped."""
-    dry = lambda part, count: count * (part[0] - part[1])
-    dropped = (dry(_BOOSTER, 6), dry(_BOOSTER, 3), dry(_FIRST, 1))
-    return jnp.concatenate(
-        [
-            b.x0 - a.xf.at[6].add(-mass)
-            for a, b, mass in zip(ends[:-1], ends[1:], dropped, strict=True)
-        ]
-    )
