@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.nominal.wrappers import Wrapped, own_fields
+from jaxguide.nominal.wrappers import FIELDS, Wrapped, own_fields
 from jaxguide.problem import (
     Free,
     Problem,
@@ -287,5 +287,5 @@ def _said(time: Any) -> str:
 
 
 # What follows from the phases is no field: dataclasses.replace may not set it.
-for _name in own_fields(Problem):
+for _name in FIELDS:
     del Phased.__dataclass_fields__[_name]

@@ -49,7 +49,7 @@ class Wrapped(Problem):
         return self.inner.endpoint_constraints(x0, xf, t0, tf)
 
 
-_FIELDS = (
+FIELDS = (
     "state_names", "control_names", "initial_time", "final_time", "initial_state", "state_bounds",
     "control_bounds", "endpoint_bounds", "path_bounds", "integral_bounds",
 )  # fmt: skip
@@ -57,7 +57,7 @@ _FIELDS = (
 
 def own_fields(problem: Problem, **changed: Any) -> dict[str, Any]:
     """The fields of a Problem around `problem`: its own, but for those `changed`."""
-    return {name: getattr(problem, name) for name in _FIELDS} | changed
+    return {name: getattr(problem, name) for name in FIELDS} | changed
 
 
 def _joined(a: tuple, b: tuple) -> tuple[Array, Array]:
