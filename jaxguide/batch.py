@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.montecarlo.cores import over_cores
+from jaxguide.nominal.guesses import check_guess
+from jaxguide.nominal.pseudospectral import Pseudospectral
 from jaxguide.problem import Problem, with_array_leaves
 from jaxguide.progress import Progress, metered
-from jaxguide.solving import chosen, compiled, on_fixed_mesh, solve
+from jaxguide.solving import chosen, compiled, is_endless, on_fixed_mesh, solve
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
@@ -52,8 +54,19 @@ def solve_batch(
     count = _lanes(batch)
     lane = lambda tree, i: _tree(lambda a: a[i], tree)
     own = isinstance(guess, Extremal) and guess.t.ndim == 2
+    if own and guess.t.shape[0] != count:
+        raise ValueError(
+            f"solve_batch: guess has {guess.t.shape[0]} lanes for {count} problems; give one a "
+            "problem, or a single Extremal for all."
+        )
+    method = chosen(batch) if method is None else method
     first = lane(batch, 0)
-    method = chosen(first) if method is None else method
+    check_guess(
+        first,
+        lane(guess, 0) if own else guess,
+        isinstance(method, Pseudospectral),
+        is_endless(first),
+    )
     if is_traced((batch, guess)):
         one = lambda p, g: solve(p, method, g, throw=False)
         return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)
@@ -116,4 +129,7 @@ def _lanes(batch: Problem) -> int:
             "needs the same one. jax.vmap(lambda k: dataclasses.replace(problem, thrust=k))"
             "(thrusts) makes them."
         )
-    return sizes.pop()[0]
+    count = sizes.pop()[0]
+    if not count:
+        raise ValueError("solve_batch: no problems were given: leading axes have length 0.")
+    return count

@@ -31,7 +31,10 @@ from jaxguide.trajectory import Extremal
 
 
 class Certificate(eqx.Module):
-    """Rows of checks. `passed` is a bool array; printed, a table that names the worst place."""
+    """Rows of checks. `passed` is a bool array; printed, a table that names the worst place.
+
+    Of a batch of extremals every array has a leading axis of lanes; printed, each row is that of
+    the worst lane."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     labels: tuple[tuple[str, ...], ...] = eqx.field(static=True)
@@ -44,7 +47,19 @@ class Certificate(eqx.Module):
     def passed(self) -> Bool[Array, " row"]:
         return self.value <= self.tolerance  # NaN fails
 
+    def worst(self) -> "Certificate":
+        """Of a batch: each row in the lane where it is furthest beyond its bound."""
+        beyond = jnp.where(
+            jnp.isnan(self.value), jnp.inf, self.value / jnp.maximum(self.tolerance, 1e-300)
+        )
+        lane = jnp.argmax(beyond, axis=0)
+        pick = lambda a: jnp.take_along_axis(a, lane[None], axis=0)[0]
+        return jax.tree_util.tree_map(pick, self)
+
     def __str__(self) -> str:
+        if self.value.ndim == 2:
+            passed = np.asarray(jnp.all(self.passed, axis=1))
+            return f"{passed.sum()} of {len(passed)} lanes pass; at worst:\n{self.worst()}"
         width = max(len(name) for name in self.names)
         lines = []
         rows = zip(
@@ -64,7 +79,9 @@ class Certificate(eqx.Module):
         return "\n".join(lines)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The table as plain data."""
+        """The table as plain data; of a batch, at its worst."""
+        if self.value.ndim == 2:
+            return self.worst().rows()
         return [
             {
                 "check": name,

@@ -438,6 +438,11 @@ def validate(problem: Problem) -> None:
     t0, tf = float(t0), float(tf)
     if math.isnan(t0) or math.isnan(tf) or math.isinf(t0):
         raise ValueError(f"{kind}: initial_time is {t0} and final_time is {tf}; give numbers.")
+    if math.isinf(tf) and is_free(problem.initial_time):
+        raise ValueError(
+            f"{kind}: final_time is infinite and initial_time is {problem.initial_time}; give a "
+            "number for one of the two."
+        )
     if not tf > t0 and not is_free(problem.final_time) and not is_free(problem.initial_time):
         raise ValueError(
             f"{kind}: final_time {tf} is not after initial_time {t0}; the horizon must be positive."

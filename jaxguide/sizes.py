@@ -36,24 +36,17 @@ def sizes_of(extremal: Extremal) -> Sizes:
     constraints what a change of everything by its size amounts to, or a bound."""
     problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
     horizon = t[-1] - t[0]
-    u_size = jnp.maximum(jnp.max(jnp.abs(u), axis=0), _finite(problem.control_bounds, problem.m))
-    u_size = _positive(u_size)
+    u_size = jnp.max(jnp.abs(u), axis=0)
+    u_size = _positive(jnp.where(u_size > 0, u_size, _finite(problem.control_bounds, problem.m)))
     x_size = state_sizes(extremal)
     z = jnp.concatenate([x_size, u_size])
     along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))
     path = jnp.max(_known(along(problem.path_constraints)) @ z, axis=0, initial=0.0)
     path = jnp.maximum(path, _finite(problem.path_bounds, path.shape[0]))
 
-    ends = (x[0], x[-1], t[0], t[-1])
-    of_ends = lambda f: jnp.concatenate(
-        [jnp.atleast_2d(j.T).T for j in jax.jacfwd(f, argnums=(0, 1, 2, 3))(*ends)], axis=-1
-    )
-    moves = jnp.concatenate([x_size, x_size, horizon[None], horizon[None]])
-    end = _known(of_ends(problem.endpoint_constraints)) @ moves
-    end = jnp.maximum(end, _finite(problem.endpoint_bounds, end.shape[0]))
-
+    end = end_sizes(extremal, x_size)
     worth = jnp.max(jnp.max(jnp.abs(extremal.costate), axis=0) * x_size)
-    e_x = jax.grad(problem.endpoint_cost, argnums=1)(*ends)
+    e_x = jax.grad(problem.endpoint_cost, argnums=1)(x[0], x[-1], t[0], t[-1])
     cost = _positive(worth + jnp.max(jnp.abs(e_x) * x_size))
 
     f = jax.vmap(problem.dynamics)(t, x, u)
@@ -62,7 +55,17 @@ def sizes_of(extremal: Extremal) -> Sizes:
     H = F + gain + jnp.sum(extremal.costate * f, axis=1)
     terms = jnp.abs(F) + jnp.sum(jnp.abs(extremal.costate * f), axis=1)
     hamiltonian = _positive(jnp.max(jnp.abs(H)) + _TERMS * jnp.max(terms))
-    return Sizes(x_size, u_size, horizon, cost, hamiltonian, _positive(path), _positive(end))
+    return Sizes(x_size, u_size, horizon, cost, hamiltonian, _positive(path), end)
+
+
+def end_sizes(extremal: Extremal, x_size: Float[Array, " n"]) -> Float[Array, " q"]:
+    """Of the endpoint constraints."""
+    problem, t, x = extremal.problem, extremal.t, extremal.x
+    e = lambda x0, xf, times: problem.endpoint_constraints(x0, xf, times[0], times[1])
+    slopes = jax.jacfwd(e, argnums=(0, 1, 2))(x[0], x[-1], jnp.stack([t[0], t[-1]]))
+    horizon = jnp.broadcast_to(t[-1] - t[0], (2,))
+    end = _known(jnp.concatenate(slopes, axis=1)) @ jnp.concatenate([x_size, x_size, horizon])
+    return _positive(jnp.maximum(end, _finite(problem.endpoint_bounds, end.shape[0])))
 
 
 def state_sizes(extremal: Extremal) -> Float[Array, " n"]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxguide.certificate import certifier
 from jaxguide.nominal.diagnosis import why
+from jaxguide.nominal.guesses import check_guess, is_key
 from jaxguide.nominal.piecewise_linear import PiecewiseLinear
 from jaxguide.nominal.pseudospectral import Pseudospectral, finished
 from jaxguide.nominal.refinement import refined
@@ -66,6 +67,7 @@ def solve(
     method.check(problem)
     direct = isinstance(method, Pseudospectral)
     without_end = direct and is_endless(problem)
+    check_guess(problem, guess, direct, without_end or is_traced(problem.final_time))
     problem = with_array_leaves(problem)
     if is_traced((problem, guess, method)):
         return _traced(method, without_end, problem, guess)
@@ -84,7 +86,7 @@ def solve(
 
 def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Extremal:
     """With the method `chosen`; where shooting finds nothing by itself, from a direct solution."""
-    method = chosen(problem)
+    method = Pseudospectral() if is_key(guess) else chosen(problem)
     if not isinstance(method, Shooting):
         return solve(problem, method, guess, throw, watch)
     extremal = solve(problem, method, guess, throw=False)
@@ -95,7 +97,8 @@ def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Extrem
         polished = solve(problem, method, direct, throw=False)
         return polished if succeeded(polished.result) else direct
     if throw:
-        raise_if_failed(extremal)
+        # The direct method says which constraint is missed, and where; shooting where it got lost.
+        raise_if_failed(direct)
     return extremal
 
 

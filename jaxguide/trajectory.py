@@ -142,8 +142,9 @@ class Extremal(Trajectory):
 
     @property
     def certificate(self) -> Any:
-        """How good this extremal is: every check, computed when asked for."""
-        return self.certifier(self)
+        """How good this extremal is: every check, computed when asked for. Of a batch, as from
+        `solve_batch`, with a leading axis of lanes."""
+        return jax.vmap(self.certifier)(self) if self.t.ndim == 2 else self.certifier(self)
 
     def __call__(self, t: Any) -> Point:
         """State, control and costate at `t`, scalar or (T,); held beyond the horizon.
@@ -153,6 +154,12 @@ class Extremal(Trajectory):
         something holds it within the segment: a bound of its own or a path constraint. H includes
         what integral constraints add.
         """
+        if self.t.ndim != 1:
+            raise ValueError(
+                f"a batch of {self.t.shape[0]} extremals was asked for its values at one time; "
+                "take jax.vmap(lambda e: e(t))(batch), or one lane: "
+                "jax.tree_util.tree_map(lambda a: a[i], batch)."
+            )
         t = jnp.asarray(t, self.t.dtype)
         return jax.vmap(_polished, in_axes=(None, 0))(self, t) if t.ndim else _polished(self, t)
 

@@ -78,6 +78,15 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The flight left finite numbers: the plant diverged. Look at this case's dispersion, or "
         "cap the command."
     )
+    undefined = (
+        "A cost, constraint or rate of the problem, or a derivative of one, is NaN or infinite "
+        "where the search went: keep clear of its singularity by bounds or a `guess`, or mend it."
+    )
+    hidden_horizon = (
+        "The final time is infinite, which could not be seen under the trace, and decides how a "
+        "problem is solved: keep it a concrete jnp.inf in what is traced, differentiating or "
+        "mapping over other fields only."
+    )
 
 
 def code(result: RESULTS) -> int:

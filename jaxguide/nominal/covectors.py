@@ -14,7 +14,7 @@ from jaxguide.nominal.box import Box, boxed, distances
 from jaxguide.nominal.mesh import left_null
 from jaxguide.nominal.shooting import unwrap_angles
 from jaxguide.nominal.transcription import Bounds, Transcription, flattened, node_times
-from jaxguide.problem import Problem, choices, with_parameters
+from jaxguide.problem import Problem, choices, is_free, with_parameters
 from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
@@ -77,10 +77,16 @@ def to_extremal(
     result = RESULTS.where(status == interior_point.INFEASIBLE, RESULTS.infeasible, result)
     finite = jnp.all(jnp.isfinite(support)) & jnp.all(jnp.isfinite(w.u))
     result = RESULTS.where(finite, result, RESULTS.optimiser_stopped)
+    f, _ = program.objective_and_residual(w)
+    residual = jnp.maximum(solution.error, solution.violation)
+    lost = jnp.isnan(residual) | ~jnp.isfinite(f)
+    result = RESULTS.where(lost, RESULTS.undefined, result)
+    if not is_free(problem.final_time):
+        endless = jnp.isinf(jnp.asarray(problem.final_time, dtype))
+        result = RESULTS.where(endless, RESULTS.hidden_horizon, result)
     k, m, r = problem.n, problem.m, n - problem.n
     q = size.end - len(program.order) - r
     nu = solution.y.end * scale.objective / scale.end
-    f, _ = program.objective_and_residual(w)
     return Extremal(
         t=t,
         x=whole(support)[:, :k] * scale.x[None, :k],
@@ -99,7 +105,7 @@ def to_extremal(
             nu[q : q + r],
         ),
         result=result,
-        residual=solution.violation,
+        residual=residual,
         degenerate=_undecided(box, solution),
         problem=problem,
         certifier=certifier,

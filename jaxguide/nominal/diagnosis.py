@@ -31,37 +31,51 @@ def why(extremal: Extremal) -> str:
 
 def _undefined(extremal: Extremal) -> str:
     """Where the problem's functions, or their derivatives, leave finite numbers."""
-    problem, t = extremal.problem, extremal.t
+    problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
     t = jnp.where(jnp.isfinite(t), t, 0.0)
-
-    def at(t: Any, x: Any, u: Any) -> tuple:
-        both = lambda f: (f, lambda *a: jnp.concatenate([d.ravel() for d in _slopes(f, *a)]))
-        dynamics, slope = both(problem.dynamics)
-        return dynamics(t, x, u), problem.running_cost(t, x, u), slope(t, x, u)
-
-    x, u = extremal.x, extremal.u
     for name, values in (("state", x), ("control", u)):
         if not np.all(np.isfinite(np.asarray(values))):
             return f"The last iterate's {name} left finite numbers."
-    f, cost, slope = (np.asarray(a) for a in jax.vmap(at)(t, x, u))
-    where = lambda k: (
-        f"at node {k} (t = {float(t[k]):.6g}, x = {np.asarray(x[k])}, u = {np.asarray(u[k])}); "
-        "keep clear of the singularity by state bounds or a guess, or mend the equation."
-    )
-    bad = ~np.isfinite(f)
-    if bad.any():
-        k, i = np.argwhere(bad)[0]
-        return f"dynamics: d({problem.state_names[i]})/dt is {f[k, i]} {where(k)}"
-    for name, values in (("running_cost", cost[:, None]), ("a derivative of dynamics", slope)):
-        bad = ~np.isfinite(values)
-        if bad.any():
-            k, i = np.argwhere(bad)[0]
-            return f"{name} is {values[k, i]} {where(k)}"
+    for name in ("dynamics", "running_cost", "path_constraints", "integrands"):
+        function = getattr(problem, name)
+        value = jax.vmap(function)(t, x, u)
+        slopes = jax.vmap(jax.jacfwd(function, argnums=(1, 2)))(t, x, u)
+        for what, array in ((name, value), (f"a derivative of {name}", slopes[0]), (
+            f"a derivative of {name}", slopes[1],
+        )):  # fmt: skip
+            found = _first_undefined(array.reshape(len(t), -1))
+            if found:
+                k, i, bad = found
+                if what == "dynamics":
+                    what = f"dynamics: d({problem.state_names[i]})/dt"
+                return (
+                    f"{what} is {bad} at node {k} (t = {float(t[k]):.6g}, x = {np.asarray(x[k])}, "
+                    f"u = {np.asarray(u[k])}); keep clear of the singularity by state bounds or a "
+                    "guess, or mend the equation."
+                )
+    ends = (x[0], x[-1], t[0], t[-1])
+    for name in ("endpoint_cost", "endpoint_constraints"):
+        function = getattr(problem, name)
+        slopes = jax.jacfwd(function, argnums=(0, 1, 2, 3))(*ends)
+        for what, array in (
+            (name, function(*ends)),
+            *((f"a derivative of {name}", s) for s in slopes),
+        ):
+            found = _first_undefined(jnp.reshape(array, (1, -1)))
+            if found:
+                return (
+                    f"{what} is {found[2]} at x0 = {np.asarray(x[0])}, xf = {np.asarray(x[-1])}, "
+                    f"t0 = {float(t[0]):.6g}, tf = {float(t[-1]):.6g}; keep clear of the "
+                    "singularity by bounds or a guess, or mend the equation."
+                )
     return ""
 
 
-def _slopes(f: Any, t: Any, x: Any, u: Any) -> Any:
-    return jax.jacfwd(f, argnums=(1, 2))(t, x, u)
+def _first_undefined(values: Any) -> tuple[int, int, float] | None:
+    """Row, column and value of the first entry that is no finite number."""
+    values = np.asarray(values)
+    bad = np.argwhere(~np.isfinite(values))
+    return (int(bad[0, 0]), int(bad[0, 1]), float(values[tuple(bad[0])])) if len(bad) else None
 
 
 def _misses(extremal: Extremal) -> list[tuple[float, str]]:

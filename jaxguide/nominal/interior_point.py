@@ -54,6 +54,7 @@ _HALVINGS, _FILTER = 30, 128
 # iterates, and stays above `_AHEAD` of that error. Chosen by experiment: free from the start, or
 # where the problem is not convex, NPSAT1 took three times the iterations.
 _NEAR, _FALL, _MEMORY, _MU_MAX, _AHEAD = 1e-3, 0.9999, 4, 1e2, 1e-4
+_IDLE = 1e-3  # curvature lent to free knots, lest one that nothing needs wander
 _SHRINK = 0.5  # of the horizon, that a step may take away
 _MULTIPLIERS_MAX = 1e3  # of the first estimate; a larger one is worth less than none
 
@@ -292,6 +293,7 @@ def _step(
     on = {name: name in ("path", "end") for name in Primal._fields}
     slacks = flattened(Primal(*(jnp.full_like(getattr(w_now, k), on[k]) for k in on)))
     sigma = program.shaped(jnp.where(estimate, slacks, s.zl / low + s.zu / high))
+    sigma = sigma._replace(times=sigma.times.at[2:].add(_IDLE))
     at_nodes, at_ends = hessians
     system = newton.System(nodes, ends, at_nodes, at_ends, sigma, program.shaped(box.given))
     gradient = flattened(newton.gradient(program, nodes, ends, w_now, _tree(jnp.zeros_like, s.y)))

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from jaxguide.linalg import single_threaded_lapack
 from jaxguide.nominal import interior_point
 from jaxguide.nominal.covectors import to_extremal
+from jaxguide.nominal.guesses import is_key
 from jaxguide.nominal.implicit import sensitivity
 from jaxguide.nominal.mesh import FAMILIES, collocation
 from jaxguide.nominal.starting import (
@@ -25,14 +26,13 @@ from jaxguide.nominal.starting import (
     edges,
     fits,
     from_extremal,
-    is_key,
     random_guess,
     straight_guess,
     unit_scale,
 )
 from jaxguide.nominal.transcription import Arcwise, Bounds, Transcription, bounds
 from jaxguide.nominal.wrappers import Endless, relaxed, rewrapped, with_integrals
-from jaxguide.problem import Problem
+from jaxguide.problem import Problem, count
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced
 
@@ -151,10 +151,16 @@ class Pseudospectral(eqx.Module):
         """Nothing that a Problem may hold is beyond it. Host only."""
 
     def check(self, problem: Problem) -> None:
-        """Refuses a mesh that memory will not hold. Host only.
+        """Refuses a mesh that memory will not hold, or that integrals do not go with. Host only.
 
-        **Raises:** `ValueError` with the estimate.
+        **Raises:** `ValueError`, with the estimate.
         """
+        if len(collocation(self.grid, self.nodes).extra) and count(problem, "integrands"):
+            raise ValueError(
+                f"Pseudospectral: grid {self.grid!r} collocates at both ends, one equation a "
+                f"segment more than an integral has unknowns, and {type(problem).__name__} has "
+                "integral constraints; use 'lgr-right', 'lgr-left' or 'lg'."
+            )
         need, have = self.memory(problem), _physical_memory()
         if need > have:
             segments = self.segments if self.fractions is None else len(self.fractions) - 1
@@ -226,13 +232,8 @@ class Pseudospectral(eqx.Module):
             w = straight_guess(program, fractions, self.knots)
         elif is_key(guess):
             w = random_guess(program, fractions, self.knots, guess)
-        elif isinstance(guess, Extremal):
-            w = from_extremal(program, fractions, self.knots, problem, guess)
         else:
-            raise ValueError(
-                f"guess is a {type(guess).__name__}; jg.Pseudospectral takes an Extremal (costates "
-                "are for jg.Shooting), a random key, or None."
-            )
+            w = from_extremal(program, fractions, self.knots, problem, guess)
         scale = designer_units(program, w)
         program = eqx.tree_at(lambda p: p.scale, program, scale)
         w = jax.tree_util.tree_map(jnp.divide, w, program.units)

@@ -1,5 +1,6 @@
 """Indirect multiple shooting: the necessary conditions solved to rounding, differentiably."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -29,6 +30,7 @@ from jaxguide.problem import (
     is_free,
     start_value,
 )
+from jaxguide.sizes import end_sizes, state_sizes
 from jaxguide.spectral import nodes_lgl
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS, is_traced
@@ -278,22 +280,29 @@ class Shooting(eqx.Module):
         worst = jnp.max(jnp.abs(boundary_residual(problem, z, arcs[:, -1])))
         zeros = lambda k: jnp.zeros((t.shape[0], k), t.dtype)
         size = jax.eval_shape(problem.path_constraints, t[0], x[0], u[0]).shape[0]
-        return Extremal(
+        cost = objective(problem, z, arcs[:, -1])
+        extremal = Extremal(
             t=t,
             x=x,
             u=u,
             reference_nodes=tau,
             costate=costate,
             final_time=tf,
-            objective=objective(problem, z, arcs[:, -1]),
+            objective=cost,
             multipliers=Multipliers(
                 z.nu, zeros(size), zeros(n), zeros(problem.m), jnp.zeros(0, t.dtype)
             ),
-            result=_judge(problem, t, x, u, costate, worst),
+            result=_judge(problem, t, x, u, costate, worst, cost),
             residual=worst,
             problem=problem,
             certifier=certifier,
         )
+        # In units where everything is small, `worst` alone would pass.
+        e = problem.endpoint_constraints(x[0], x[-1], t0, tf)
+        miss = jnp.abs(e - bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)[0])
+        there = jnp.all(miss <= 1e-7 * end_sizes(extremal, state_sizes(extremal))) | jnp.isnan(cost)
+        result = RESULTS.where(there, extremal.result, RESULTS.not_converged)
+        return dataclasses.replace(extremal, result=result)
 
 
 def _newton(residual: Any, z: Unknowns, problem: Problem) -> Unknowns:
@@ -325,14 +334,17 @@ def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"
             lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
         )
         here, there = rates(t, x, u), rates(t, x, u + shift)
-        periodic = jnp.all(jnp.abs(here - there) <= 1e-9 * (1 + jnp.abs(here)))
+        size = jnp.max(jnp.maximum(jnp.abs(here), jnp.abs(there)), axis=0)
+        periodic = jnp.all(jnp.abs(here - there) <= 1e-9 * size[None])
         turns = jnp.round(jnp.diff(u[:, j]) / turn)
         total = jnp.concatenate([jnp.zeros(1, u.dtype), jnp.cumsum(turns)])
         columns.append(jnp.where(periodic, u[:, j] - turn * total, u[:, j]))
     return jnp.stack(columns, axis=1)
 
 
-def _judge(problem: Problem, t: Array, x: Array, u: Array, costate: Array, worst: Array) -> RESULTS:
+def _judge(
+    problem: Problem, t: Array, x: Array, u: Array, costate: Array, worst: Array, cost: Array
+) -> RESULTS:
     """What the shot extremal is worth."""
     scale = 1 + jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(costate))
     converged = worst <= 1e-9 * scale  # Newton is quadratic: short of this it did not converge
@@ -349,4 +361,5 @@ def _judge(problem: Problem, t: Array, x: Array, u: Array, costate: Array, worst
     legal = inside(x, xlo, xhi) & inside(u, ulo, uhi) & inside(path, plo, phi)
     result = RESULTS.where(minimising, RESULTS.successful, RESULTS.not_minimising)
     result = RESULTS.where(legal, result, RESULTS.bounds_violated)
+    result = RESULTS.where(jnp.isfinite(cost), result, RESULTS.undefined)
     return RESULTS.where(converged, result, RESULTS.not_converged)

@@ -167,11 +167,6 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     return w._replace(x=x, u=w.u + (share * width)[None, None])
 
 
-def is_key(guess: Any) -> bool:
-    """Whether `guess` is a random key: a random start."""
-    return isinstance(guess, jax.Array) and jnp.issubdtype(guess.dtype, jax.dtypes.prng_key)
-
-
 def random_guess(
     program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...], key: Array
 ) -> Primal:

@@ -62,7 +62,8 @@ def _near(values: Float[np.ndarray, "node k"], bounds: Any, share: float) -> np.
     """-1 near the lower bound, 1 near the upper, 0 between."""
     lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
     near = share * np.minimum(hi - lo, np.ptp(values, axis=0) + 1e-12)
-    return np.where(values - lo <= near, -1, 0) + np.where(hi - values <= near, 1, 0)
+    active = np.where(values - lo <= near, -1, 0) + np.where(hi - values <= near, 1, 0)
+    return np.where(hi > lo, active, 0)  # an equality has no arcs
 
 
 def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
