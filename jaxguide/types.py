@@ -50,7 +50,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "direct method."
     )
     underresolved = (
-        "The mesh does not resolve the solution: raise `segments` or `degree`, or lower tolerance."
+        "The mesh does not resolve the solution to `mesh_tolerance`: raise `segments` or `nodes`, "
+        "solve outside a trace, which refines, or take it as it is with `refinements=0`."
     )
     gain_unresolved = (
         "The gain is not resolved at this time: raise `segments` or `nodes`, or stay further "

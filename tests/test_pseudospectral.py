@@ -154,7 +154,7 @@ def test_static_parameter():
 
 
 def test_guesses_that_are_no_extremal_are_refused():
-    with pytest.raises(ValueError, match="takes an Extremal"):
+    with pytest.raises(ValueError, match="costates are for jg.Shooting"):
         jg.solve(DoubleIntegrator(), jg.Pseudospectral(), guess=np.ones(2))
 
 

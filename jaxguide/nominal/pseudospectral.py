@@ -3,6 +3,7 @@
 **Source:** Ross & Karpenko, review (2012), sections 3 and 4.
 """
 
+import dataclasses
 import math
 import os
 from typing import Any
@@ -19,6 +20,7 @@ from jaxguide.nominal.covectors import to_extremal
 from jaxguide.nominal.guesses import is_key
 from jaxguide.nominal.implicit import sensitivity
 from jaxguide.nominal.mesh import FAMILIES, collocation
+from jaxguide.nominal.mesh_errors import segment_errors
 from jaxguide.nominal.starting import (
     blank_duals,
     designer_units,
@@ -32,9 +34,9 @@ from jaxguide.nominal.starting import (
 )
 from jaxguide.nominal.transcription import Arcwise, Bounds, Transcription, bounds
 from jaxguide.nominal.wrappers import Endless, relaxed, rewrapped, with_integrals
-from jaxguide.problem import Problem, count
+from jaxguide.problem import Problem, count, endpoint_count
 from jaxguide.trajectory import Extremal
-from jaxguide.types import is_traced
+from jaxguide.types import RESULTS, is_traced
 
 _MOST_NODES = 512
 
@@ -70,9 +72,11 @@ class Pseudospectral(eqx.Module):
     - `refinements`: how often `solve` may raise the number of nodes or segments (it also moves
       breaks, and frees the junctions of a clear structure) until each segment's defect between the
       nodes, relative to the state's span, is below `mesh_tolerance`. Zero: one solve. Under a
-      trace the mesh stays.
-    - `log`: print the optimiser's iterations: objective, worst constraint, scaled error, barrier,
-      regularisation, step; "r" marks restoration, "e" an estimate of the multipliers.
+      trace and in `solve_batch` the mesh stays, and a solution that it does not resolve so far is
+      `RESULTS.underresolved`; zero refinements take it as it is.
+    - `log`: print the designer units and the optimiser's iterations: objective, worst constraint,
+      scaled error, barrier, regularisation, step; "r" marks restoration, "e" an estimate of the
+      multipliers.
     - `quick`: compile in half the time, for programs a fifth slower. False where one mesh is solved
       on many times. Under a trace whoever compiles decides.
 
@@ -181,8 +185,33 @@ class Pseudospectral(eqx.Module):
         return 8 * segments * (3 * entries + C * (n + m + 2) ** 2 * 4)
 
     def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
-        """The extremal on the fixed mesh, without host checks; `solve` wraps this."""
-        return finished(problem, *self.prepared(problem, guess), certifier)
+        """The extremal on the fixed mesh, without host checks; `solve` wraps this. Where the method
+        would refine, but no host can, one short of `mesh_tolerance` is `RESULTS.underresolved`."""
+        extremal = finished(problem, *self.prepared(problem, guess), certifier)
+        if not self.refinements:
+            return extremal
+        resolved = jnp.max(segment_errors(extremal)) <= self.mesh_tolerance
+        good = extremal.result == RESULTS.successful
+        result = RESULTS.where(good & ~resolved, RESULTS.underresolved, extremal.result)
+        return dataclasses.replace(extremal, result=result)
+
+    def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
+        """Designer units: what the solver takes for one of each state, control, time, constraint
+        and objective, in user units, from bounds and guess. Also printed by `log`. Host only."""
+        scale = self.prepared(problem, guess)[0].scale
+        numbered = lambda what, k: [f"{what} {i}" for i in range(k)]
+        paths = [".".join(map(str, path)) for path in problem.parameter_paths()]
+        q = endpoint_count(problem)
+        named = (
+            (problem.state_names, scale.x),
+            (problem.control_names, scale.u),
+            (("time",), scale.t[None]),
+            (paths, scale.p),
+            (numbered("path constraint", scale.path.shape[0]), scale.path),
+            (numbered("endpoint constraint", q), scale.end),
+            (("objective",), scale.objective[None]),
+        )
+        return {k: float(v) for names, values in named for k, v in zip(names, values, strict=False)}
 
     def whole(self, problem: Problem) -> Problem:
         """`problem` with what the transcription needs besides: integrals, relaxed dynamics."""

@@ -10,22 +10,19 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxguide.nominal.mesh_errors import segment_errors
 from jaxguide.nominal.pseudospectral import Pseudospectral
 from jaxguide.nominal.structure import Arcs, arcs, corrected, laid_out, without_collapsed
 from jaxguide.nominal.transcription import Arcwise
 from jaxguide.nominal.wrappers import Endless
 from jaxguide.problem import Problem
-from jaxguide.sizes import sizes_of, state_sizes
+from jaxguide.sizes import sizes_of
 from jaxguide.spectral import (
-    differentiation_matrix,
-    interpolation_matrix,
     legendre_matrix,
-    nodes_lg,
 )
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, succeeded
@@ -62,25 +59,6 @@ class Progress(NamedTuple):
 
 
 @eqx.filter_jit
-def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
-    """By segment, the integral of |dx/dt - f| between the nodes, relative to the state's span."""
-    problem, breaks = extremal.problem, extremal.breaks
-    gauss, weights = (jnp.asarray(a, breaks.dtype) for a in nodes_lg(2 * extremal.degree))
-    half = jnp.diff(breaks) / 2
-    times = (breaks[1:] + breaks[:-1])[:, None] / 2 + half[:, None] * gauss[None]
-    to_gauss = interpolation_matrix(extremal.reference_nodes, gauss)
-    x = jnp.einsum("gp,spk->sgk", to_gauss, extremal.by_segment(extremal.x))
-    u = jnp.einsum("gp,spk->sgk", to_gauss, extremal.control_by_segment())
-    D = to_gauss @ differentiation_matrix(extremal.reference_nodes)
-    rate = jnp.einsum("gp,spk->sgk", D, extremal.by_segment(extremal.x))
-    rate = rate / jnp.where(half > 0, half, 1.0)[:, None, None]
-    f = jax.vmap(jax.vmap(problem.dynamics))(times, x, u)
-    span = state_sizes(extremal)
-    gap = half[:, None] * jnp.einsum("g,sgk->sk", weights, jnp.abs(rate - f))
-    return jnp.max(gap / span[None], axis=1)
-
-
-@eqx.filter_jit
 def tails(extremal: Extremal) -> Float[Array, ""]:
     """Largest of the last two Legendre coefficients of state and costate, relative to their size:
     by Jackson's theorem what a finer grid could still change."""
@@ -114,19 +92,33 @@ def refined(
 ) -> Extremal:
     """`extremal` again on better meshes, each from the last, until state and costate are resolved
     to `mesh_tolerance`, the refinements are used up, or a solve fails (the last good one is kept).
+    `watch` hears of every mesh, and last of why it stopped.
 
     First the breaks move to where the error is. Then, where controls switch between bounds, the
     junctions become free knots and the controls stay on their bounds between them: exact to
     rounding if that is the structure, and taken only if the certificate's own measures agree. A
     smooth solution gets more nodes; what is left, more segments.
     """
-    error = float(jnp.max(segment_errors(extremal)))
-    watch(Progress("first mesh", extremal, error))
+    watch(Progress("first mesh", extremal, float(jnp.max(segment_errors(extremal)))))
+    last, why = _climbed(run, method, problem, extremal, watch)
+    watch(Progress(f"stopped, {why}", last, float(jnp.max(segment_errors(last)))))
+    return last
+
+
+def _climbed(
+    run: Callable[[Any, Problem, Any], Extremal],
+    method: Pseudospectral,
+    problem: Problem,
+    extremal: Extremal,
+    watch: Callable[[Progress], None],
+) -> tuple[Extremal, str]:
+    """The last good extremal, and why no better one is sought."""
     original, worst, moves, raised, tried = method, np.inf, 0, 0, -1
     candidate, doubt = None, np.inf
-    while raised <= method.refinements:
+    while True:
         errors = np.asarray(segment_errors(extremal))
         if not succeeded(extremal.result) or not np.all(np.isfinite(errors)):
+            why = "for the solve failed"
             break
         found = arcs(extremal)
         resolved = errors.max() <= method.mesh_tolerance
@@ -137,15 +129,24 @@ def refined(
             tried = raised
             exact, wrong = structured(run, original, problem, extremal, found, watch)
             if wrong <= _RIGHT:
-                return exact
+                return exact, f"the structure is clear: {len(found.junctions)} junctions"
             if wrong <= _WRONG and wrong < doubt:
                 candidate, doubt = exact, wrong
-        if resolved and (len(found.junctions) or float(tails(extremal)) <= method.mesh_tolerance):
+        if resolved and len(found.junctions):
+            why = "states resolved; junctions remain between nodes"
+            break
+        if resolved and float(tails(extremal)) <= method.mesh_tolerance:
+            why = "states and costates resolved"
             break
         fractions = _fractions(extremal)
         segments, nodes = len(fractions) - 1, method.nodes
         if move:
             step, worst, moves = "breaks moved", errors.max(), moves + 1
+        elif raised == method.refinements:
+            why = (
+                f"short of mesh_tolerance {method.mesh_tolerance:g}: refinements used up, {raised}"
+            )
+            break
         else:
             worst, moves, raised = np.inf, 0, raised + 1
             if smooth:
@@ -153,18 +154,20 @@ def refined(
             elif 2 * segments <= _MOST_SEGMENTS:
                 step, segments = "more segments", 2 * segments
             else:
-                break
-            if raised > method.refinements:
+                why = f"short of mesh_tolerance {method.mesh_tolerance:g} on the largest mesh"
                 break
         method = _meshed(method, moved(fractions, errors, segments), nodes)
         better = run(method, problem, extremal)
         error = float(jnp.max(segment_errors(better)))
         watch(Progress(step, better, error))
         if not succeeded(better.result):
+            why = "for no solution was found on the better mesh; that of the last is kept"
             break
         if error < errors.max() or step != "breaks moved":
             extremal = better
-    return extremal if candidate is None else candidate
+    if candidate is None:
+        return extremal, why
+    return candidate, f"{why}; the structure found stands, complementarity {doubt:.0e}"
 
 
 def _fractions(extremal: Extremal) -> np.ndarray:
