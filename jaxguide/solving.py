@@ -119,6 +119,7 @@ def on_fixed_mesh(problem: Problem, method: Any) -> Callable[[Problem, Any], Ext
     return jax.tree_util.Partial(_traced, method, without_end)
 
 
+@eqx.filter_jit  # else a bare jax.grad runs it operation by operation
 def _traced(method: Any, without_end: bool, problem: Problem, guess: Any) -> Extremal:
     if without_end:
         problem = endless(problem, method.time_scale)

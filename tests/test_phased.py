@@ -1,5 +1,9 @@
 """Phases one after another: linked, with jumps, staged."""
 
+import dataclasses
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,7 +39,9 @@ def test_phases():
     np.testing.assert_allclose(burn.final_time, 2 * switch + 4 / 3, rtol=1e-8)
     np.testing.assert_allclose(burn.x[0], fall.x[-1], atol=1e-9)
     np.testing.assert_allclose(burn.costate[0], fall.costate[-1], atol=1e-7)
-    assert bool(burn.certificate.passed.all()), str(burn.certificate)
+    for phase in (e, fall, burn):  # transversality of the fall by what pulls at its end
+        assert bool(phase.certificate.passed.all()), str(phase.certificate)
+    assert "static parameters" in e.certificate.names  # both durations
 
 
 @pytest.mark.slow
@@ -72,33 +78,81 @@ def test_goddard_in_three_phases():
     np.testing.assert_allclose(e.objective, known.value, atol=known.uncertainty)
 
 
+class First(DoubleIntegrator):
+    """Half the way of the double integrator, without an end of its own."""
+
+    final_time = 0.5
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return jnp.zeros(0)
+
+
+class Second(DoubleIntegrator):
+    initial_state = None
+    final_time = 1.0
+
+
+SMALL = jg.Pseudospectral(nodes=4, segments=1, refinements=0)
+
+
 def test_phases_that_do_not_join_are_refused():
     with pytest.raises(ValueError, match="say in `links` how they join"):
         jg.Phased((DoubleIntegrator(), EarthMars()))
     with pytest.raises(ValueError, match="give at least two"):
         jg.Phased((DoubleIntegrator(),))
+    with pytest.raises(ValueError, match=r"phase 2, Second, starts at 1.0 and ends at 1.0"):
+        jg.Phased((First(final_time=1.0), Second()))
+    with pytest.raises(ValueError, match="initial_state has 1 entries for 2 states"):
+        jg.Phased((First(initial_state=(0.0,)), Second()))
+
+    def cost(jump):
+        return jg.Phased((First(), Second()), lambda ends: ends[1].x0 - ends[0].xf - jump).n * 1.0
+
+    with pytest.raises(ValueError, match="closes over a traced number"):
+        jax.grad(cost)(0.5)
+
+
+def test_phases_are_edited_where_they_are():
+    phased = jg.Phased((First(), Second()))
+    with pytest.raises(TypeError, match="control_bounds"):
+        dataclasses.replace(phased, control_bounds=(-1.0, 1.0))
+    where = lambda p: (p.phases[0].initial_state, p.phases[0].control_bounds)
+    moved = eqx.tree_at(where, phased, ((0.5, 0.0), (-2.5, 2.5)))
+    assert moved.initial_state[:2] == (0.5, 0.0)
+    np.testing.assert_array_equal(moved.control_bounds[1], [2.5, np.inf])
+    # From half way, u = 3 - 6 t but for the bound: the first phase flies at 2.5 at most.
+    free = jg.solve(
+        dataclasses.replace(phased, phases=(First(initial_state=(0.5, 0.0)), Second())), SMALL
+    )
+    np.testing.assert_allclose(free.objective, 1.5, rtol=1e-9)
+    held = jg.solve(moved, SMALL)
+    assert held.objective > 1.5 + 1e-3 and held.u[:, 0].max() <= 2.5
+
+
+class Jump(eqx.Module):
+    """The second phase starts `by` further on."""
+
+    by: float
+
+    def __call__(self, ends):
+        ahead = jnp.stack([jnp.asarray(self.by), jnp.zeros(())])
+        return ends[1].x0 - ends[0].xf - ahead
+
+
+def cost(by):
+    """J = 6 (1 - by)^2: the rest of the way."""
+    return jg.solve(jg.Phased((First(), Second()), Jump(by)), SMALL, throw=False).objective
 
 
 def test_a_jump_of_the_state_by_links():
-    # Half the way is given: from x = 0 to 1/4, then from 3/4 to 1.
-    class First(DoubleIntegrator):
-        final_time = 0.5
+    np.testing.assert_allclose(jax.value_and_grad(cost)(0.5), (1.5, -6.0), rtol=1e-8)
 
-        def endpoint_constraints(self, x0, xf, t0, tf):
-            return xf - jnp.array([0.25, 1.0])
 
-    class Second(DoubleIntegrator):
-        initial_state = None
-        final_time = 1.0
-
-    def jump(ends):
-        return ends[1].x0 - ends[0].xf - jnp.array([0.5, 0.0])
-
-    e = jg.solve(
-        jg.Phased((First(), Second()), jump), jg.Pseudospectral(nodes=4, segments=1, refinements=0)
-    )
-    # Both halves fly at u = +-2: x = t^2, and backwards; J = int u^2/2 dt = 2.
-    np.testing.assert_allclose(e.objective, 2.0, rtol=1e-9)
+@pytest.mark.slow  # a program of half a minute
+def test_derivatives_of_phases_mapped():
+    costs, slopes = jax.vmap(jax.value_and_grad(cost))(jnp.array([0.0, 0.5]))
+    np.testing.assert_allclose(costs, [6.0, 1.5], rtol=1e-9)
+    np.testing.assert_allclose(slopes, [-12.0, -6.0], rtol=1e-8)
 
 
 @pytest.mark.slow

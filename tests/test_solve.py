@@ -363,7 +363,7 @@ def test_controls_that_do_not_minimise_are_refused(regulator, r):
 
 def test_not_minimising_is_told_apart(earth_mars):
     e = earth_mars
-    judge = lambda u: _judge(e.problem, e.t, e.x, u, e.costate, e.residual)
+    judge = lambda u: _judge(e.problem, e.t, e.x, u, e.costate, e.residual, e.objective)
     assert bool(judge(e.u) == jg.RESULTS.successful)
     assert bool(judge(e.u + jnp.pi) == jg.RESULTS.not_minimising)  # H maximised
 

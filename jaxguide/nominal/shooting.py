@@ -326,16 +326,18 @@ def _if_finite(new: Unknowns, old: Unknowns) -> Unknowns:
 
 def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"]) -> Array:
     """Removes jumps of 2 pi from controls in which the Problem is periodic."""
-    turn = 2 * np.pi
+    rates = jax.vmap(
+        lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
+    )
+    here, turn = rates(t, x, u), 2 * np.pi
     columns = []
     for j in range(problem.m):
-        shift = jnp.zeros_like(u).at[:, j].set(turn)
-        rates = jax.vmap(
-            lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
-        )
-        here, there = rates(t, x, u), rates(t, x, u + shift)
-        size = jnp.max(jnp.maximum(jnp.abs(here), jnp.abs(there)), axis=0)
-        periodic = jnp.all(jnp.abs(here - there) <= 1e-9 * size[None])
+        moved = lambda by, j=j: rates(t, x, u.at[:, j].add(by))
+        there, aside = moved(turn), moved(turn / 4)
+        size = jnp.max(jnp.maximum(jnp.abs(here), jnp.abs(there)), axis=0)[None]
+        # Where a quarter turn is nothing either, the control is no angle.
+        felt = jnp.any(jnp.abs(here - aside) > 1e-6 * size)
+        periodic = felt & jnp.all(jnp.abs(here - there) <= 1e-9 * size)
         turns = jnp.round(jnp.diff(u[:, j]) / turn)
         total = jnp.concatenate([jnp.zeros(1, u.dtype), jnp.cumsum(turns)])
         columns.append(jnp.where(periodic, u[:, j] - turn * total, u[:, j]))
