@@ -54,7 +54,7 @@ def solve_batch(
     count = _lanes(batch)
     lane = lambda tree, i: _tree(lambda a: a[i], tree)
     own = isinstance(guess, Extremal) and guess.t.ndim == 2
-    if own and guess.t.shape[0] != count:
+    if guess is not None and own and guess.t.shape[0] != count:
         raise ValueError(
             f"solve_batch: guess has {guess.t.shape[0]} lanes for {count} problems; give one a "
             "problem, or a single Extremal for all."

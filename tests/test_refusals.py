@@ -1,6 +1,7 @@
 """Bad input and undefined functions: refused or reported by name, with the remedy."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from conftest import DoubleIntegrator
 
 import jaxguide as jg
 
-SMALL = jg.Pseudospectral(nodes=4, segments=2, refinements=0)
+SMALL: Any = jg.Pseudospectral(nodes=4, segments=2, refinements=0)
 
 
 class WithOne(DoubleIntegrator):

@@ -207,7 +207,7 @@ class Phased(Problem):
         return jnp.concatenate([b.x0 - a.xf for a, b in zip(ends[:-1], ends[1:], strict=True)])
 
     def _links_count(self) -> int:
-        number = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+        number: Any = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.result_type(float))
         ends = tuple(PhaseEnds(number(p.n), number(p.n), number(), number()) for p in self.phases)
         return jax.eval_shape(lambda ends: self._links(ends), ends).shape[0]
 
@@ -227,10 +227,9 @@ class Phased(Problem):
         states it has at its ends: `Linked`. Durations must be positive."""
         problem = extremal.problem
         assert isinstance(problem, Phased)
-        per_state = lambda y: problem.split_state(y) if y is not None else [None] * len(self.phases)
-        per_control = lambda y: (
-            problem.split_control(y) if y is not None else [None] * len(self.phases)
-        )
+        none: Any = [None] * len(self.phases)
+        per_state = lambda y: none if y is None else problem.split_state(y)
+        per_control = lambda y: none if y is None else problem.split_control(y)
         m = extremal.multipliers
         cut = lambda y, sizes: jnp.split(y, np.cumsum(sizes)[:-1], axis=-1)
         path = cut(m.path, [count(p, "path_constraints") for p in problem.phases])

@@ -1,0 +1,73 @@
+"""An extremal as the checks look at it: at its nodes, and on Gauss points between them."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.nominal.conditions import endpoint_lagrangian
+from jaxguide.problem import Problem, hamiltonian
+from jaxguide.sizes import sizes_of
+from jaxguide.spectral import interpolation_matrix, nodes_lg
+from jaxguide.trajectory import Extremal
+
+
+def constrained_hamiltonian(
+    problem: Problem, t: Array, x: Array, u: Array, costate: Array, held: Array
+) -> Float[Array, ""]:
+    """H with the multipliers `held` of path constraints, states, controls and integrals: review,
+    H bar."""
+    h, r = problem.path_constraints(t, x, u), problem.integrands(t, x, u)
+    return hamiltonian(problem, t, x, u, costate) + jnp.dot(held, jnp.concatenate([h, x, u, r]))
+
+
+class Along:
+    """What several checks share, computed while they are traced."""
+
+    def __init__(self, extremal: Extremal):
+        self.extremal, self.size = extremal, sizes_of(extremal)
+        t, m = extremal.t, extremal.multipliers
+        gauss, weights = (jnp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
+        self.gauss, self.weights, self.breaks = gauss, weights, extremal.breaks
+        self.half = jnp.diff(self.breaks) / 2
+        middle = (self.breaks[1:] + self.breaks[:-1]) / 2
+        integral = jnp.broadcast_to(m.integral, (len(t), len(m.integral)))
+        # By node: (t, x, u, costate, multipliers of H bar).
+        self.held = jnp.concatenate([m.path, m.state, m.control, integral], axis=1)
+        self.nodes = (t, extremal.x, extremal.u, extremal.costate, self.held)
+        self.parts = (
+            extremal.by_segment(t[:, None])[..., 0],
+            extremal.by_segment(extremal.x),
+            extremal.control_by_segment(),
+            extremal.costate_by_segment(),
+            extremal.by_segment(self.held),
+        )
+        to_gauss = interpolation_matrix(extremal.reference_nodes, gauss)
+        times = middle[:, None] + self.half[:, None] * gauss[None, :]
+        between = (jnp.einsum("gp,spk->sgk", to_gauss, a) for a in self.parts[1:])
+        self.between = (times, *between)
+
+    def at_nodes(self, f: Callable) -> Array:
+        """f(problem, t, x, u, costate, held) at every node."""
+        return jax.vmap(lambda *at: f(self.extremal.problem, *at))(*self.nodes)
+
+    def at_gauss(self, f: Callable, problem: Problem | None = None) -> Array:
+        """The same on the Gauss points of every segment; of another `problem`, if given."""
+        of = self.extremal.problem if problem is None else problem
+        return jax.vmap(jax.vmap(lambda *at: f(of, *at)))(*self.between)
+
+    def integrals(self, values: Float[Array, "segment gauss *k"]) -> Float[Array, "segment *k"]:
+        """Over each segment."""
+        sums = jnp.einsum("g,sg...->s...", self.weights, values)
+        return self.half.reshape(-1, *(1,) * (sums.ndim - 1)) * sums
+
+    def ends(self) -> tuple[Array, Array, Array, Array]:
+        """x0, xf, t0, tf."""
+        e = self.extremal
+        return e.x[0], e.x[-1], e.t[0], e.t[-1]
+
+    def endpoint_gradient(self) -> tuple[Array, Array, Array, Array]:
+        """Of Ebar with respect to `ends`."""
+        g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))
+        return g(self.extremal.problem, self.extremal.multipliers.endpoint, *self.ends())

@@ -1,0 +1,52 @@
+"""Checks that fly: the control through the dynamics, and the second variation backwards."""
+
+import diffrax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from jaxguide.certificate.along import Along
+from jaxguide.certificate.table import Rows
+from jaxguide.neighboring.linearization import terminal_conditions
+from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, conjugate_ahead, solve_sweeps
+from jaxguide.problem import Problem
+from jaxguide.trajectory import Extremal
+
+
+def flown(rows: Rows, a: Along) -> None:
+    """Its states against those of the interpolated control, and conjugate points."""
+    extremal = a.extremal
+    problem, t = extremal.problem, extremal.t
+    gap = (_propagate(extremal) - extremal.x) / a.size.x[None]
+    rows.add("propagated state", problem.state_names, gap, t, 1e-8)
+    # The last break with one ahead is just before it: 1 there, 0 where there is none.
+    ahead = _conjugate(extremal)
+    last = jnp.where(jnp.any(ahead), ahead.shape[0] - 1 - jnp.argmax(ahead[::-1]), 0)
+    count = jnp.any(ahead).astype(t.dtype)
+    rows.add_signed("conjugate points", ("one follows",), count, extremal.breaks[last], 0.0)
+
+
+def _propagate(extremal: Extremal) -> Array:
+    """States flown from x(t0) with the interpolated control, at the nodes."""
+    problem: Problem = extremal.problem
+    rate = lambda t, x, args: problem.dynamics(t, x, extremal.interpolate(extremal.u, t))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(rate),
+        diffrax.Dopri8(),
+        extremal.t[0],
+        extremal.t[-1],
+        None,
+        extremal.x[0],
+        stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
+        saveat=diffrax.SaveAt(ts=extremal.t),
+        max_steps=16384,
+        throw=False,
+    )
+    assert solution.ys is not None
+    return solution.ys
+
+
+def _conjugate(extremal: Extremal) -> Bool[Array, " break"]:
+    """Whether a conjugate point lies between each break of the mesh (the last left out) and tf."""
+    terminal, times = terminal_conditions(extremal), extremal.breaks[:-1]
+    pair = solve_sweeps(extremal, terminal, times, SEGMENTS, NODES, SWEEPS, ())
+    return conjugate_ahead(pair.sweep, times)

@@ -1,0 +1,122 @@
+"""The Certificate: how good an extremal is, each necessary condition as a number with its bound."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+
+class Certificate(eqx.Module):
+    """Rows of checks. `passed` is a bool array; printed, a table that names the worst place.
+
+    Of a batch of extremals every array has a leading axis of lanes; printed, each row is that of
+    the worst lane."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    labels: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    value: Float[Array, " row"]
+    tolerance: Float[Array, " row"]
+    time: Float[Array, " row"]
+    component: Array
+
+    @property
+    def passed(self) -> Bool[Array, " row"]:
+        return self.value <= self.tolerance  # NaN fails
+
+    def worst(self) -> "Certificate":
+        """Of a batch: each row in the lane where it is furthest beyond its bound."""
+        beyond = jnp.where(
+            jnp.isnan(self.value), jnp.inf, self.value / jnp.maximum(self.tolerance, 1e-300)
+        )
+        lane = jnp.argmax(beyond, axis=0)
+        pick = lambda a: jnp.take_along_axis(a, lane[None], axis=0)[0]
+        return jax.tree_util.tree_map(pick, self)
+
+    def __str__(self) -> str:
+        if self.value.ndim == 2:
+            passed = np.asarray(jnp.all(self.passed, axis=1))
+            return f"{passed.sum()} of {len(passed)} lanes pass; at worst:\n{self.worst()}"
+        width = max(len(name) for name in self.names)
+        lines = []
+        rows = zip(
+            self.names,
+            self.labels,
+            np.asarray(self.value),
+            np.asarray(self.tolerance),
+            np.asarray(self.time),
+            np.asarray(self.component),
+            np.asarray(self.passed),
+            strict=True,
+        )
+        for name, labels, value, tolerance, time, component, passed in rows:
+            where = f"{labels[int(component) % len(labels)]} at t = {time:.6g}" if labels else ""
+            verdict = "ok   " if passed else "FAILS"
+            lines.append(f"{verdict} {name:{width}s} {value:9.2e} <= {tolerance:7.1e}  {where}")
+        return "\n".join(lines)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The table as plain data; of a batch, at its worst."""
+        if self.value.ndim == 2:
+            return self.worst().rows()
+        return [
+            {
+                "check": name,
+                "value": float(v),
+                "tolerance": float(tol),
+                "time": float(t),
+                "where": labels[int(c) % len(labels)] if labels else "",
+                "passed": bool(p),
+            }
+            for name, labels, v, tol, t, c, p in zip(
+                self.names, self.labels, self.value, self.tolerance, self.time, self.component,
+                self.passed, strict=True,
+            )
+        ]  # fmt: skip
+
+
+class Rows:
+    """Collects rows while the checks are traced."""
+
+    def __init__(self):
+        self.names, self.labels = [], []
+        self.value, self.tolerance, self.time, self.component = [], [], [], []
+
+    def add(self, name: str, labels: Any, values: Array, times: Array, tolerance: float) -> None:
+        """`values` (k, c): errors of components named by `labels` at `times` (k,)."""
+        if values.size == 0:
+            return
+        values = jnp.abs(values)
+        flat = jnp.where(jnp.isnan(values), jnp.inf, values)
+        worst = jnp.argmax(flat)
+        node, component = worst // values.shape[1], worst % values.shape[1]
+        self.names.append(name)
+        self.labels.append(tuple(labels))
+        self.value.append(values[node, component])
+        self.tolerance.append(jnp.asarray(tolerance, values.dtype))
+        self.time.append(times[node])
+        self.component.append(component)
+
+    def add_signed(
+        self, name: str, labels: Any, value: Array, time: Array, tolerance: float
+    ) -> None:
+        """One signed number that must not exceed `tolerance`."""
+        self.names.append(name)
+        self.labels.append(tuple(labels))
+        self.value.append(value)
+        self.tolerance.append(jnp.asarray(tolerance, value.dtype))
+        self.time.append(time)
+        self.component.append(jnp.zeros((), jnp.int64 if value.dtype == jnp.float64 else jnp.int32))
+
+    def done(self) -> Certificate:
+        stack = jnp.stack
+        return Certificate(
+            tuple(self.names),
+            tuple(self.labels),
+            stack(self.value),
+            stack(self.tolerance),
+            stack(self.time),
+            stack(self.component),
+        )
