@@ -225,6 +225,7 @@ def test_degenerate_bounds_are_flagged():
     assert flags == [False, True, False]
 
 
+@pytest.mark.slow  # two programs of half a minute; test_bounds.py has each kind of bound once
 def test_implicit_derivatives_with_an_active_bound():
     """d tf of a bang-bang landing by gravity, the thrust limit and the initial height, both ways,
     against finite differences of solutions on the same mesh."""
@@ -381,7 +382,9 @@ class HeldByPath(Held):
         return u[:1]
 
 
-@pytest.mark.parametrize(("problem", "over"), [(Held(), 0.0), (HeldByPath(), 5e-6)])
+@pytest.mark.parametrize(
+    ("problem", "over"), [(Held(), 0.0), pytest.param(HeldByPath(), 5e-6, marks=pytest.mark.slow)]
+)
 def test_controls_between_nodes_keep_to_what_holds_them(problem, over):
     e = jg.solve(problem, jg.Pseudospectral(nodes=4, segments=2, refinements=0))
     u = np.asarray(e(jnp.array([0.1, 0.5, 0.93])).u)

@@ -34,7 +34,7 @@ from jaxguide.nominal.starting import (
 )
 from jaxguide.nominal.transcription import Arcwise, Bounds, Transcription, bounds
 from jaxguide.nominal.wrappers import Endless, relaxed, rewrapped, with_integrals
-from jaxguide.problem import Problem, count, endpoint_count
+from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, is_traced
 
@@ -198,7 +198,7 @@ class Pseudospectral(eqx.Module):
     def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
         """Designer units: what the solver takes for one of each state, control, time, constraint
         and objective, in user units, from bounds and guess. Also printed by `log`. Host only."""
-        scale = self.prepared(problem, guess)[0].scale
+        scale = _scale(self, with_array_leaves(problem), guess)
         numbered = lambda what, k: [f"{what} {i}" for i in range(k)]
         paths = [".".join(map(str, path)) for path in problem.parameter_paths()]
         q = endpoint_count(problem)
@@ -296,6 +296,11 @@ def finished(
     solution = _solved((whole, program.edges), program, start, options)
     program = _stated(program, (whole, program.edges))
     return to_extremal(problem, program, bounds(program), solution, certifier)
+
+
+@eqx.filter_jit
+def _scale(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
+    return method.prepared(problem, guess)[0].scale
 
 
 def _physical_memory() -> float:
