@@ -116,9 +116,11 @@ def batch(count: int, N: int, tolerance: float, peer: Any) -> dict[str, Any]:
     thrusts = 0.1405 * (1 + 0.02 * np.linspace(-1, 1, count))
     many = jax.vmap(lambda k: dataclasses.replace(problems.EarthMars(), thrust=k))(thrusts)
     out: dict[str, Any] = {"problems": count}
-    coarse = jg.Pseudospectral("lgr-right", 6, 6, tolerance=tolerance, quick=False)
+    coarse = jg.Pseudospectral("lgr-right", 6, 6, tolerance=tolerance, quick=False, refinements=0)
     for name, method in {
-        f"LGL {N}": jg.Pseudospectral("lgl", N + 1, 1, tolerance=tolerance, quick=False),
+        f"LGL {N}": jg.Pseudospectral(
+            "lgl", N + 1, 1, tolerance=tolerance, quick=False, refinements=0
+        ),
         "LGR 6 x 6": coarse,
     }.items():
         solved, first = cold(lambda m=method: jg.solve_batch(many, m, nominal))
@@ -149,7 +151,7 @@ def batch(count: int, N: int, tolerance: float, peer: Any) -> dict[str, Any]:
 
 def slope_share(repeats: int) -> dict[str, float]:
     """d r_f/d thrust beside the solve itself, on LGR 12 x 6."""
-    method = jg.Pseudospectral("lgr-right", 12, 6)
+    method = jg.Pseudospectral("lgr-right", 12, 6, refinements=0)
     at = lambda k: (
         jg.solve(dataclasses.replace(problems.EarthMars(), thrust=k), method, throw=False).objective
     )

@@ -245,6 +245,8 @@ class Pseudospectral(eqx.Module):
         """The transcription in designer units, where the search starts, and how."""
         single_threaded_lapack()
         dtype = jnp.result_type(float)
+        # Where the search starts does not matter to the solution; where the breaks are, does.
+        problem = jax.lax.stop_gradient(problem)
         whole = self.whole(problem)
         if self.fractions is None:
             fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
@@ -277,7 +279,6 @@ class Pseudospectral(eqx.Module):
                 start, warm = start._replace(**duals(program, fractions, w, guess)), True
                 mu, push = 1e-6, 1e-6
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
-        # Where the search starts does not matter to the solution; where the breaks are, does.
         still, start = jax.lax.stop_gradient((program, start))
         program = eqx.tree_at(lambda p: p.edges, still, program.edges)
         return program, start, jax.tree_util.tree_map(jnp.asarray, options)
