@@ -263,6 +263,14 @@ def bounds_of(bounds: Any, size: int, dtype: Any) -> tuple[Array, Array]:
     )
 
 
+def initial_bounds(problem: Problem) -> tuple[Array, Array]:
+    """Of the initial state, where it is free: its own and those of every state."""
+    lo, hi = bounds_of(problem.state_bounds, problem.n, jnp.result_type(float))
+    entries = [e if is_free(e) else Free() for e in initial_entries(problem)]
+    own = [jnp.stack([jnp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
+    return jnp.maximum(lo, own[0]), jnp.minimum(hi, own[1])
+
+
 def count(problem: Problem, name: str) -> int:
     """Components of its path constraints or integrands."""
     dtype = jnp.result_type(float)

@@ -37,25 +37,27 @@ def sizes_of(extremal: Extremal) -> Sizes:
     problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
     horizon = t[-1] - t[0]
     u_size = jnp.max(jnp.abs(u), axis=0)
-    u_size = _positive(jnp.where(u_size > 0, u_size, _finite(problem.control_bounds, problem.m)))
+    u_size = positive(
+        jnp.where(u_size > 0, u_size, largest_bound(problem.control_bounds, problem.m))
+    )
     x_size = state_sizes(extremal)
     z = jnp.concatenate([x_size, u_size])
     along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))
     path = jnp.max(_known(along(problem.path_constraints)) @ z, axis=0, initial=0.0)
-    path = jnp.maximum(path, _finite(problem.path_bounds, path.shape[0]))
+    path = jnp.maximum(path, largest_bound(problem.path_bounds, path.shape[0]))
 
     end = end_sizes(extremal, x_size)
     worth = jnp.max(jnp.max(jnp.abs(extremal.costate), axis=0) * x_size)
     e_x = jax.grad(problem.endpoint_cost, argnums=1)(x[0], x[-1], t[0], t[-1])
-    cost = _positive(worth + jnp.max(jnp.abs(e_x) * x_size))
+    cost = positive(worth + jnp.max(jnp.abs(e_x) * x_size))
 
     f = jax.vmap(problem.dynamics)(t, x, u)
     F = jax.vmap(problem.running_cost)(t, x, u)
     gain = jax.vmap(problem.integrands)(t, x, u) @ extremal.multipliers.integral
     H = F + gain + jnp.sum(extremal.costate * f, axis=1)
     terms = jnp.abs(F) + jnp.sum(jnp.abs(extremal.costate * f), axis=1)
-    hamiltonian = _positive(jnp.max(jnp.abs(H)) + _TERMS * jnp.max(terms))
-    return Sizes(x_size, u_size, horizon, cost, hamiltonian, _positive(path), end)
+    hamiltonian = positive(jnp.max(jnp.abs(H)) + _TERMS * jnp.max(terms))
+    return Sizes(x_size, u_size, horizon, cost, hamiltonian, positive(path), end)
 
 
 def end_sizes(extremal: Extremal, x_size: Float[Array, " n"]) -> Float[Array, " q"]:
@@ -65,7 +67,7 @@ def end_sizes(extremal: Extremal, x_size: Float[Array, " n"]) -> Float[Array, " 
     slopes = jax.jacfwd(e, argnums=(0, 1, 2))(x[0], x[-1], jnp.stack([t[0], t[-1]]))
     horizon = jnp.broadcast_to(t[-1] - t[0], (2,))
     end = _known(jnp.concatenate(slopes, axis=1)) @ jnp.concatenate([x_size, x_size, horizon])
-    return _positive(jnp.maximum(end, _finite(problem.endpoint_bounds, end.shape[0])))
+    return positive(jnp.maximum(end, largest_bound(problem.endpoint_bounds, end.shape[0])))
 
 
 def state_sizes(extremal: Extremal) -> Float[Array, " n"]:
@@ -75,7 +77,7 @@ def state_sizes(extremal: Extremal) -> Float[Array, " n"]:
     moved = _known(slopes) @ jnp.concatenate([span, most])
     # The median: at the end of an infinite horizon rates grow beyond all bounds.
     moved = (t[-1] - t[0]) * jnp.median(moved, axis=0)
-    return _positive(jnp.where(span >= _REST * moved, span, _MOVED * moved))
+    return positive(jnp.where(span >= _REST * moved, span, _MOVED * moved))
 
 
 def _joined(f: Any, n: int) -> Any:
@@ -90,11 +92,11 @@ def _known(slopes: Array) -> Array:
     return jnp.where(jnp.isfinite(slopes), jnp.abs(slopes), 0.0)
 
 
-def _finite(bounds: Any, k: int) -> Float[Array, " k"]:
+def largest_bound(bounds: Any, k: int) -> Float[Array, " k"]:
     """The larger finite bound, or 0."""
     both = jnp.stack(bounds_of(bounds, k, jnp.result_type(float)))
     return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0.0), axis=0)
 
 
-def _positive(size: Array) -> Array:
+def positive(size: Array) -> Array:
     return jnp.where(size > 0, size, 1.0)

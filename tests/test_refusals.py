@@ -105,7 +105,7 @@ class Ends(DoubleIntegrator):
         (Cost(), r"endpoint_cost is nan at x0 = "),
         (Ends(), r"endpoint_constraints is nan at x0 = "),
     ],
-    ids=lambda p: type(p).__name__,
+    ids=["path", "integrand", "endpoint-cost", "endpoint-constraint"],
 )
 def test_undefined_functions_are_named(problem, words):
     with pytest.raises(jg.SolveError, match=words):

@@ -5,7 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.problem import Free, Problem, bounds_of, initial_entries, is_free
+from jaxguide.problem import bounds_of
+from jaxguide.sizes import largest_bound, positive
 
 
 def slackness(
@@ -26,16 +27,6 @@ def overstep(values: Float[Array, "*k c"], bounds: Any) -> Float[Array, "*k c"]:
     return jnp.maximum(lo - values, 0.0) + jnp.maximum(values - hi, 0.0)
 
 
-def initial_bounds(problem: Problem) -> tuple[Array, Array]:
-    """Of the initial state, where it is free: its own and those of every state."""
-    lo, hi = bounds_of(problem.state_bounds, problem.n, jnp.result_type(float))
-    entries = [e if is_free(e) else Free() for e in initial_entries(problem)]
-    own = [jnp.stack([jnp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
-    return jnp.maximum(lo, own[0]), jnp.minimum(hi, own[1])
-
-
 def bound_size(values: Float[Array, " k"], bounds: Any) -> Float[Array, " k"]:
     """The largest of a value and its finite bounds; 1 if that is zero."""
-    both = jnp.stack([*bounds_of(bounds, values.shape[0], values.dtype), values])
-    size = jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0.0), axis=0)
-    return jnp.where(size > 0, size, 1.0)
+    return positive(jnp.maximum(jnp.abs(values), largest_bound(bounds, values.shape[0])))

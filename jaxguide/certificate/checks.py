@@ -10,10 +10,17 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxguide.certificate.along import Along, constrained_hamiltonian
-from jaxguide.certificate.bounded import bound_size, initial_bounds, overstep, slackness
+from jaxguide.certificate.bounded import bound_size, overstep, slackness
 from jaxguide.certificate.table import Rows
 from jaxguide.nominal.conditions import endpoint_lagrangian
-from jaxguide.problem import Problem, hamiltonian, initial_values, initially_free, is_free
+from jaxguide.problem import (
+    Problem,
+    hamiltonian,
+    initial_bounds,
+    initial_values,
+    initially_free,
+    is_free,
+)
 from jaxguide.spectral import legendre_matrix
 
 

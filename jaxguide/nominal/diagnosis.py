@@ -40,9 +40,7 @@ def _undefined(extremal: Extremal) -> str:
         function = getattr(problem, name)
         value = jax.vmap(function)(t, x, u)
         slopes = jax.vmap(jax.jacfwd(function, argnums=(1, 2)))(t, x, u)
-        for what, array in ((name, value), (f"a derivative of {name}", slopes[0]), (
-            f"a derivative of {name}", slopes[1],
-        )):  # fmt: skip
+        for what, array in ((name, value), *((f"a derivative of {name}", s) for s in slopes)):
             found = _first_undefined(array.reshape(len(t), -1))
             if found:
                 k, i, bad = found

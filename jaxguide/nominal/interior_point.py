@@ -54,7 +54,7 @@ _HALVINGS, _FILTER = 30, 128
 # iterates, and stays above `_AHEAD` of that error. Chosen by experiment: free from the start, or
 # where the problem is not convex, NPSAT1 took three times the iterations.
 _NEAR, _FALL, _MEMORY, _MU_MAX, _AHEAD = 1e-3, 0.9999, 4, 1e2, 1e-4
-_IDLE = 1e-3  # curvature lent to free knots, lest one that nothing needs wander
+_IDLE = 1e-3  # curvature lent to free knots, lest one that nothing needs wander; best of five tried
 _SHRINK = 0.5  # of the horizon, that a step may take away
 _MULTIPLIERS_MAX = 1e3  # of the first estimate; a larger one is worth less than none
 

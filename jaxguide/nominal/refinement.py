@@ -99,20 +99,12 @@ def refined(
     rounding if that is the structure, and taken only if the certificate's own measures agree. A
     smooth solution gets more nodes; what is left, more segments.
     """
+
+    def stopped(why: str, last: Extremal) -> Extremal:
+        watch(Progress(f"stopped, {why}", last, float(jnp.max(segment_errors(last)))))
+        return last
+
     watch(Progress("first mesh", extremal, float(jnp.max(segment_errors(extremal)))))
-    last, why = _climbed(run, method, problem, extremal, watch)
-    watch(Progress(f"stopped, {why}", last, float(jnp.max(segment_errors(last)))))
-    return last
-
-
-def _climbed(
-    run: Callable[[Any, Problem, Any], Extremal],
-    method: Pseudospectral,
-    problem: Problem,
-    extremal: Extremal,
-    watch: Callable[[Progress], None],
-) -> tuple[Extremal, str]:
-    """The last good extremal, and why no better one is sought."""
     original, worst, moves, raised, tried = method, np.inf, 0, 0, -1
     candidate, doubt = None, np.inf
     while True:
@@ -129,7 +121,7 @@ def _climbed(
             tried = raised
             exact, wrong = structured(run, original, problem, extremal, found, watch)
             if wrong <= _RIGHT:
-                return exact, f"the structure is clear: {len(found.junctions)} junctions"
+                return stopped(f"the structure is clear: {len(found.junctions)} junctions", exact)
             if wrong <= _WRONG and wrong < doubt:
                 candidate, doubt = exact, wrong
         if resolved and len(found.junctions):
@@ -166,8 +158,8 @@ def _climbed(
         if error < errors.max() or step != "breaks moved":
             extremal = better
     if candidate is None:
-        return extremal, why
-    return candidate, f"{why}; the structure found stands, complementarity {doubt:.0e}"
+        return stopped(why, extremal)
+    return stopped(f"{why}; the structure found stands, complementarity {doubt:.0e}", candidate)
 
 
 def _fractions(extremal: Extremal) -> np.ndarray:

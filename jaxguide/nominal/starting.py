@@ -69,13 +69,11 @@ def horizon_guess(problem: Problem) -> tuple[Array, Array]:
         bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
         tf = jnp.where(bounded, start_value(end), jnp.clip(t0 + 1.0, lo, hi))
     # What nobody gave makes way.
-    unsaid = lambda entry: is_free(entry) and entry.guess is None
     halfway = lambda a, b, other: jnp.where(jnp.isfinite(b), (a + b) / 2, other)
-    if unsaid(end):
+    if is_free(end) and end.guess is None:
         tf = jnp.where(tf > t0, tf, halfway(t0, number(end.hi), t0 + 1.0))
-    if unsaid(start):
-        early = t0 >= (halfway(number(start.lo), tf, tf) if unsaid(end) else tf)
-        t0 = jnp.where(early, halfway(tf, number(start.lo), tf - 1.0), t0)
+    if is_free(start) and start.guess is None:
+        t0 = jnp.where(tf > t0, t0, halfway(tf, number(start.lo), tf - 1.0))
     return t0, tf
 
 
@@ -91,7 +89,8 @@ def straight_guess(
     t0, tf = horizon_guess(program.problem)
     q = size.end - len(program.order)
     e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, q, dtype)
-    scale = jnp.tile(typical(lo, hi, x0[None]), 2)
+    said = _said(lo, hi, x0[None])
+    scale = jnp.tile(jnp.where(said > 0, said, 1.0), 2)
     # Free components of the initial state move with the final ones.
     free = jnp.concatenate([jnp.asarray(initially_free(program.problem)), jnp.ones(n, bool)])
     scale = jnp.where(free, scale, 0.0)
@@ -121,9 +120,9 @@ def straight_guess(
     p = [start_value(v) for v in parameters(program.problem)]
     times = placed(t0, tf, fractions, knots)
     straight = without_slacks(program, x0, x, over(u), times, p)
-    unbounded = jnp.isinf(jnp.stack(bounds_of(problem.control_bounds, size.m, dtype))).any(axis=0)
-    middle = jnp.clip(0.0, *bounds_of(problem.control_bounds, size.m, dtype))
-    u = jnp.where(unbounded, middle + (u - middle) * sizes(program.problem, straight)[1], u)
+    u_bounds = bounds_of(problem.control_bounds, size.m, dtype)
+    unbounded, middle = jnp.isinf(jnp.stack(u_bounds)).any(axis=0), jnp.clip(0.0, *u_bounds)
+    u = jnp.where(unbounded, middle + (u - middle) * natural_units(program.problem, straight)[1], u)
     ends_at = lambda xf: problem.endpoint_constraints(x0, xf, t0, tf)
     unasked = ~jnp.any(jax.jacfwd(ends_at)(xf) != 0, axis=0) if q else jnp.ones(n, bool)
     rests = unasked & (jnp.abs(x0) < _REST) & (jnp.abs(xf) < _REST)
@@ -177,15 +176,15 @@ def random_guess(
     size, dtype, rule = program.sizes, program.dtype, program.rule
     k_x, k_u, k_t = jax.random.split(key, 3)
     lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
-    scale = typical(lo, hi, jnp.concatenate([w.x0[None], w.x.reshape(-1, size.n)]))
-    waves = jax.random.normal(k_x, (2, size.n), dtype) * scale[None] / 3
+    of_x, of_u = natural_units(program.problem, w)
+    waves = jax.random.normal(k_x, (2, size.n), dtype) * of_x[None] / 3
     s = fractions_at(fractions, rule.support[1:])
     bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
     x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])
     u_lo, u_hi = bounds_of(program.problem.control_bounds, size.m, dtype)
     bounded = jnp.isfinite(u_lo) & jnp.isfinite(u_hi)
     middle = jnp.where(bounded, (u_lo + u_hi) / 2, 0.0)
-    half = jnp.where(bounded, (u_hi - u_lo) / 2, 3.0)
+    half = jnp.where(bounded, (u_hi - u_lo) / 2, 3.0 * of_u)
     ends = middle[None] + half[None] * jax.random.uniform(k_u, (2, size.m), dtype, -1.0, 1.0)
     ends = jnp.clip(ends, u_lo[None], u_hi[None])
     s = fractions_at(fractions, rule.nodes)[..., None]
@@ -299,12 +298,6 @@ def duals(
     return {"y": Rows(defect, path, end), "net": net}
 
 
-def typical(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
-    """The larger finite bound; else the largest value seen; else 1."""
-    said = _said(lo, hi, seen)
-    return jnp.where(said > 0, said, 1.0)
-
-
 def _said(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]:
     """The larger finite bound; else the largest value seen, unless it is at rest; else 0."""
     bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
@@ -314,14 +307,14 @@ def _said(lo: Array, hi: Array, seen: Float[Array, "k n"]) -> Float[Array, " n"]
 
 
 @jax.jit
-def sizes(problem: Problem, w: Primal) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+def natural_units(problem: Problem, w: Primal) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
     """What a state and a control amount to, in user units: by their bounds or values; where nothing
     is said, 1, unless the dynamics tell that their size is another by far.
 
     They tell of one unknown from its neighbours: what moves a state of known size by as much within
     the horizon, or how far a state is moved by what is known.
     """
-    n, m, dtype = problem.n, problem.m, w.x.dtype
+    problem, n, m, dtype = evened(problem), problem.n, problem.m, w.x.dtype
     seen = jnp.concatenate([w.x0[None], w.x.reshape(-1, n)])
     x = _said(*bounds_of(problem.state_bounds, n, dtype), seen)
     u = _said(*bounds_of(problem.control_bounds, m, dtype), jnp.zeros((1, m), dtype))
@@ -354,7 +347,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     """Scales from bounds and the guess; constraints and objective by their gradients there."""
     problem, size, dtype = evened(program.problem), program.sizes, program.dtype
     program = eqx.tree_at(lambda q: q.problem, program, problem)
-    x, u = sizes(problem, w)
+    x, u = natural_units(problem, w)
     span = w.times[1] - w.times[0]
     t = jnp.where(span > 0, span, 1.0)
     p = jnp.where(jnp.abs(w.p) > 0, jnp.abs(w.p), 1.0)

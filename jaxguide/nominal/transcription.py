@@ -17,6 +17,7 @@ from jaxguide.problem import (
     Problem,
     bounds_of,
     count,
+    initial_bounds,
     initial_values,
     initially_free,
     is_free,
@@ -325,18 +326,8 @@ def bounds(program: Transcription) -> Bounds:
         return number(entry), number(entry)
 
     states = bounds_of(problem.state_bounds, size.n, dtype)
-    start = initial_values(problem, dtype)
-    x0 = [start, start]
-    free = jnp.asarray(initially_free(problem))
-    if any(initially_free(problem)):
-        entries = problem.initial_state
-        for i, pick in enumerate((lambda e: e.lo, lambda e: e.hi)):
-            if isinstance(entries, (tuple, list)):
-                own = jnp.stack([number(pick(e) if is_free(e) else 0.0) for e in entries])
-            else:
-                own = states[i] if entries is None else over(number(pick(entries)), size.n)
-            tighter = jnp.maximum if i == 0 else jnp.minimum
-            x0[i] = jnp.where(free, tighter(own, states[i]), start)
+    start, free = initial_values(problem, dtype), jnp.asarray(initially_free(problem))
+    x0 = [jnp.where(free, side, start) for side in initial_bounds(problem)]
     times = [scalar(problem.initial_time), scalar(problem.final_time)]
     if is_free(problem.final_time) and not is_free(problem.initial_time):
         times[1] = (jnp.maximum(times[1][0], times[0][0]), times[1][1])
