@@ -97,7 +97,8 @@ def refined(
     First the breaks move to where the error is. Then, where controls switch between bounds, the
     junctions become free knots and the controls stay on their bounds between them: exact to
     rounding if that is the structure, and taken only if the certificate's own measures agree. A
-    smooth solution gets more nodes; what is left, more segments.
+    smooth solution gets more nodes; what is left, more segments. The last mesh is solved once more,
+    to 1e-11: a barrier at `tolerance` shows in the covectors of bounds nearby.
     """
 
     def stopped(why: str, last: Extremal) -> Extremal:
@@ -105,7 +106,7 @@ def refined(
         return last
 
     watch(Progress("first mesh", extremal, float(jnp.max(segment_errors(extremal)))))
-    original, worst, moves, raised, tried = method, np.inf, 0, 0, -1
+    original, mesh, worst, moves, raised, tried = method, method, np.inf, 0, 0, -1
     candidate, doubt = None, np.inf
     while True:
         errors = np.asarray(segment_errors(extremal))
@@ -135,9 +136,7 @@ def refined(
         if move:
             step, worst, moves = "breaks moved", errors.max(), moves + 1
         elif raised == method.refinements:
-            why = (
-                f"short of mesh_tolerance {method.mesh_tolerance:g}: refinements used up, {raised}"
-            )
+            why = f"state or costate short of {method.mesh_tolerance:g} after {raised} refinements"
             break
         else:
             worst, moves, raised = np.inf, 0, raised + 1
@@ -146,7 +145,7 @@ def refined(
             elif 2 * segments <= _MOST_SEGMENTS:
                 step, segments = "more segments", 2 * segments
             else:
-                why = f"short of mesh_tolerance {method.mesh_tolerance:g} on the largest mesh"
+                why = f"state or costate short of {method.mesh_tolerance:g} on the largest mesh"
                 break
         method = _meshed(method, moved(fractions, errors, segments), nodes)
         better = run(method, problem, extremal)
@@ -156,8 +155,15 @@ def refined(
             why = "for no solution was found on the better mesh; that of the last is kept"
             break
         if error < errors.max() or step != "breaks moved":
-            extremal = better
+            extremal, mesh = better, method
     if candidate is None:
+        if succeeded(extremal.result):
+            sharper = dataclasses.replace(mesh, starts=1, tolerance=min(mesh.tolerance, _EXACT))
+            exact = run(sharper, problem, extremal)
+            error, allowed = (float(jnp.max(segment_errors(e))) for e in (exact, extremal))
+            # Chattering would use what lies between the nodes.
+            if succeeded(exact.result) and error <= max(allowed, method.mesh_tolerance):
+                extremal = exact
         return stopped(why, extremal)
     return stopped(f"{why}; the structure found stands, complementarity {doubt:.0e}", candidate)
 
