@@ -26,7 +26,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
-from jaxguide.montecarlo.cores import over_cores  # noqa: E402
+from jaxguide.host.cores import over_cores  # noqa: E402
 from jaxguide.problems import EarthMars  # noqa: E402
 from jaxguide.problems.earth_mars import mission  # noqa: E402
 

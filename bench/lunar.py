@@ -22,7 +22,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
-from jaxguide.laws.suboptimal import LinearGains  # noqa: E402
+from jaxguide.laws.gain_interpolation import LinearGains  # noqa: E402
 from jaxguide.problems import lunar_launch  # noqa: E402
 
 INTERVAL, END = 4.0, 1e-6

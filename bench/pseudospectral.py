@@ -29,11 +29,11 @@ from gains import PEERS, best_of, cold  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
 from jaxguide import problems  # noqa: E402
-from jaxguide.nominal import interior_point  # noqa: E402
-from jaxguide.nominal.mesh import collocation  # noqa: E402
-from jaxguide.nominal.transcription import bounds  # noqa: E402
+from jaxguide.host.compilation import quick_compilation  # noqa: E402
+from jaxguide.nominal.direct import interior_point  # noqa: E402
+from jaxguide.nominal.direct.collocation import collocation  # noqa: E402
+from jaxguide.nominal.direct.limits import bounds  # noqa: E402
 from jaxguide.problem import with_array_leaves  # noqa: E402
-from jaxguide.solving import quick_compilation  # noqa: E402
 
 TRUTH = 1.525277700649  # r_f of Earth-Mars
 # Earth-Mars on a fixed mesh that meets 1e-9: half of its segments where the thrust turns over.

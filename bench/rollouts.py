@@ -36,9 +36,9 @@ import numpy as np  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
 from jaxguide.flight.simulate import prepare, simulate  # noqa: E402
-from jaxguide.montecarlo.cores import over_cores  # noqa: E402
-from jaxguide.montecarlo.tiles import TILE, compiler_options  # noqa: E402
+from jaxguide.host.cores import over_cores  # noqa: E402
 from jaxguide.problems.earth_mars import dispersions, mission  # noqa: E402
+from jaxguide.sweeping.tiles import TILE, compiler_options  # noqa: E402
 
 PEERS = Path(os.environ.get("JAXGUIDE_PEERS", Path(__file__).parents[2] / "shared" / "bench"))
 

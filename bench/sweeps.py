@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jaxguide.montecarlo.flags import deciding, set_for_flights
+from jaxguide.host.flags import deciding, set_for_flights
 
 PEERS = Path(os.environ.get("JAXGUIDE_PEERS", Path(__file__).parents[2] / "shared" / "bench"))
 FLAGS = ["-O3", "-march=native", "-ffast-math", "-fopenmp"]

@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jaxguide import problems as problems
     from jaxguide import tuning as tuning
-    from jaxguide.batch import solve_batch as solve_batch
-    from jaxguide.bellman import Bellman as Bellman
-    from jaxguide.bellman import bellman as bellman
     from jaxguide.certificate import Certificate as Certificate
     from jaxguide.certificate import certify as certify
     from jaxguide.flight.integrators import Adaptive as Adaptive
@@ -20,6 +17,8 @@ if TYPE_CHECKING:
     from jaxguide.flight.mission import Mission as Mission
     from jaxguide.flight.simulate import Flight as Flight
     from jaxguide.flight.simulate import simulate as simulate
+    from jaxguide.laws.gain_interpolation import LinearGains as LinearGains
+    from jaxguide.laws.gain_interpolation import TimeToGoGains as TimeToGoGains
     from jaxguide.laws.holds import History as History
     from jaxguide.laws.holds import HoldControl as HoldControl
     from jaxguide.laws.holds import HoldDeviation as HoldDeviation
@@ -27,11 +26,8 @@ if TYPE_CHECKING:
     from jaxguide.laws.law import Law as Law
     from jaxguide.laws.law import OpenLoop as OpenLoop
     from jaxguide.laws.neighboring import NeighboringOptimal as NeighboringOptimal
-    from jaxguide.laws.suboptimal import LinearGains as LinearGains
     from jaxguide.laws.suboptimal import NeighboringSuboptimal as NeighboringSuboptimal
     from jaxguide.laws.suboptimal import TimeToGo as TimeToGo
-    from jaxguide.laws.suboptimal import TimeToGoGains as TimeToGoGains
-    from jaxguide.montecarlo.compare import compare as compare
     from jaxguide.montecarlo.covariance import linear_covariance as linear_covariance
     from jaxguide.montecarlo.dispersions import LogNormal as LogNormal
     from jaxguide.montecarlo.dispersions import MultivariateNormal as MultivariateNormal
@@ -41,27 +37,31 @@ if TYPE_CHECKING:
     from jaxguide.montecarlo.dispersions import Uniform as Uniform
     from jaxguide.montecarlo.rollouts import rerun as rerun
     from jaxguide.montecarlo.rollouts import rollouts as rollouts
-    from jaxguide.montecarlo.stopping import PercentileWithin as PercentileWithin
-    from jaxguide.montecarlo.stopping import SuccessWithin as SuccessWithin
-    from jaxguide.montecarlo.sweep import sweep as sweep
-    from jaxguide.montecarlo.written import dispersions_from as dispersions_from
     from jaxguide.neighboring.gains import GainSchedule as GainSchedule
     from jaxguide.neighboring.gains import gain_schedule as gain_schedule
     from jaxguide.neighboring.linearization import LinearTPBVP as LinearTPBVP
     from jaxguide.neighboring.linearization import linearize as linearize
     from jaxguide.neighboring.suboptimal import SuboptimalSchedule as SuboptimalSchedule
     from jaxguide.neighboring.suboptimal import suboptimal_gains as suboptimal_gains
-    from jaxguide.nominal.phased import Phased as Phased
-    from jaxguide.nominal.phased import PhaseEnds as PhaseEnds
-    from jaxguide.nominal.piecewise_linear import PiecewiseLinear as PiecewiseLinear
-    from jaxguide.nominal.pseudospectral import Pseudospectral as Pseudospectral
-    from jaxguide.nominal.shooting import Shooting as Shooting
-    from jaxguide.nominal.state_as_time import StateAsTime as StateAsTime
+    from jaxguide.nominal.direct.pseudospectral import Pseudospectral as Pseudospectral
+    from jaxguide.nominal.indirect.shooting import Shooting as Shooting
+    from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear as PiecewiseLinear
     from jaxguide.problem import Free as Free
     from jaxguide.problem import Problem as Problem
-    from jaxguide.solving import solve as solve
+    from jaxguide.solving.batch import solve_batch as solve_batch
+    from jaxguide.solving.bellman import Bellman as Bellman
+    from jaxguide.solving.bellman import bellman as bellman
+    from jaxguide.solving.solve import solve as solve
+    from jaxguide.sweeping.compare import compare as compare
+    from jaxguide.sweeping.stopping import PercentileWithin as PercentileWithin
+    from jaxguide.sweeping.stopping import SuccessWithin as SuccessWithin
+    from jaxguide.sweeping.sweep import sweep as sweep
+    from jaxguide.sweeping.written import dispersions_from as dispersions_from
     from jaxguide.trajectory import Extremal as Extremal
     from jaxguide.trajectory import Trajectory as Trajectory
+    from jaxguide.transforms.phased import Phased as Phased
+    from jaxguide.transforms.phased import PhaseEnds as PhaseEnds
+    from jaxguide.transforms.state_as_time import StateAsTime as StateAsTime
     from jaxguide.trig import sincos as sincos
     from jaxguide.tuning.loop import tune as tune
     from jaxguide.types import RESULTS as RESULTS
@@ -71,7 +71,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Adaptive": "flight.integrators",
-    "Bellman": "bellman",
+    "Bellman": "solving.bellman",
     "Certificate": "certificate",
     "Command": "laws.law",
     "Extremal": "trajectory",
@@ -82,7 +82,7 @@ _HOME = {
     "HoldControl": "laws.holds",
     "HoldDeviation": "laws.holds",
     "Law": "laws.law",
-    "LinearGains": "laws.suboptimal",
+    "LinearGains": "laws.gain_interpolation",
     "LinearTPBVP": "neighboring.linearization",
     "LogNormal": "montecarlo.dispersions",
     "Mission": "flight.mission",
@@ -91,29 +91,29 @@ _HOME = {
     "NeighboringSuboptimal": "laws.suboptimal",
     "Normal": "montecarlo.dispersions",
     "OpenLoop": "laws.law",
-    "PercentileWithin": "montecarlo.stopping",
-    "PhaseEnds": "nominal.phased",
-    "Phased": "nominal.phased",
-    "PiecewiseLinear": "nominal.piecewise_linear",
+    "PercentileWithin": "sweeping.stopping",
+    "PhaseEnds": "transforms.phased",
+    "Phased": "transforms.phased",
+    "PiecewiseLinear": "nominal.parametric.piecewise_linear",
     "Problem": "problem",
-    "Pseudospectral": "nominal.pseudospectral",
+    "Pseudospectral": "nominal.direct.pseudospectral",
     "RESULTS": "types",
     "Relative": "montecarlo.dispersions",
     "RungeKutta4": "flight.integrators",
-    "Shooting": "nominal.shooting",
+    "Shooting": "nominal.indirect.shooting",
     "SolveError": "types",
-    "StateAsTime": "nominal.state_as_time",
+    "StateAsTime": "transforms.state_as_time",
     "SuboptimalSchedule": "neighboring.suboptimal",
-    "SuccessWithin": "montecarlo.stopping",
+    "SuccessWithin": "sweeping.stopping",
     "TimeToGo": "laws.suboptimal",
-    "TimeToGoGains": "laws.suboptimal",
+    "TimeToGoGains": "laws.gain_interpolation",
     "Trajectory": "trajectory",
     "TruncatedNormal": "montecarlo.dispersions",
     "Uniform": "montecarlo.dispersions",
-    "bellman": "bellman",
+    "bellman": "solving.bellman",
     "certify": "certificate",
-    "compare": "montecarlo.compare",
-    "dispersions_from": "montecarlo.written",
+    "compare": "sweeping.compare",
+    "dispersions_from": "sweeping.written",
     "gain_schedule": "neighboring.gains",
     "linear_covariance": "montecarlo.covariance",
     "linearize": "neighboring.linearization",
@@ -121,10 +121,10 @@ _HOME = {
     "rollouts": "montecarlo.rollouts",
     "simulate": "flight.simulate",
     "sincos": "trig",
-    "solve": "solving",
-    "solve_batch": "batch",
+    "solve": "solving.solve",
+    "solve_batch": "solving.batch",
     "suboptimal_gains": "neighboring.suboptimal",
-    "sweep": "montecarlo.sweep",
+    "sweep": "sweeping.sweep",
     "tune": "tuning.loop",
 }
 _MODULES = ("export", "plotting", "problems", "report", "reproduce", "tuning")

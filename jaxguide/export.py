@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from jaxguide.montecarlo import store as stores
+from jaxguide.sweeping import store as stores
 from jaxguide.types import message
 
 _BLOCK = 65_536  # cases at once

@@ -4,20 +4,14 @@ On CPU a `vmap` over LAPACK calls runs them one by one and has deadlocked at bat
 batched QR is a loop. The matrices of guidance are small (2n by 2n), so elimination by hand wins.
 """
 
-import functools
-import importlib
-import os
 from typing import Any
 
 import equinox.internal as eqxi
-import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import lineax as lx
-import threadpoolctl
 from jaxtyping import Array, Bool, Float
 
-_THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 _UNROLL = 8  # up to this size elimination is unrolled, so that XLA fuses it; chosen by experiment
 
 
@@ -143,20 +137,3 @@ class SmallLU(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return True
-
-
-@functools.cache
-def single_threaded_lapack() -> None:
-    """From here on SciPy's LAPACK, which XLA calls on CPU, works in the calling thread alone.
-
-    Its own threads spin while they wait: beside any other busy process a direct solve of 50 ms
-    took 15 s. NumPy's library stays as it is, where it is another; so does everything if one of
-    `OPENBLAS_NUM_THREADS`, `MKL_NUM_THREADS`, `OMP_NUM_THREADS` says how many to use. Host only.
-    """
-    if any(name in os.environ for name in _THREAD_COUNTS):
-        return
-    importlib.import_module("scipy.linalg.cython_lapack")
-    blas = threadpoolctl.ThreadpoolController().select(user_api="blas")
-    for library in blas.lib_controllers:
-        if len(blas.lib_controllers) == 1 or "numpy" not in str(library.filepath):
-            library.set_num_threads(1)

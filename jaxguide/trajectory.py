@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.linalg import solve
-from jaxguide.problem import Chosen, Problem, bounds_of, hamiltonian
+from jaxguide.bounds import bounds_of
+from jaxguide.conditions.control import polish_control
+from jaxguide.conditions.sizes import Sizes, sizes_of
+from jaxguide.problem import Chosen, Problem
 from jaxguide.spectral import interpolate
 from jaxguide.types import RESULTS
-
-_FREE = 1e-7  # relative to the control's size: what a barrier's inactive bounds stay below
 
 
 class Point(NamedTuple):
@@ -128,6 +128,11 @@ class Extremal(Trajectory):
     # Static parameters that the solver chose; `problem` holds their values.
     chosen: Chosen | None = None
 
+    def sizes(self) -> Sizes:
+        """How large each quantity is along the extremal: what its errors are relative to."""
+        m = self.multipliers
+        return sizes_of(self.problem, self.t, self.x, self.u, self.costate, m.integral)
+
     def control_by_segment(self) -> Float[Array, "segment p m"]:
         """Nodal controls segment by segment, each with its own end."""
         return self._own_ends(self.u, self.u_before)
@@ -191,25 +196,3 @@ def _polished(extremal: Extremal, t: Array) -> Point:
     if extremal.u_before is not None:
         polished = jnp.clip(polished, *bounds_of(problem.control_bounds, len(u), u.dtype))
     return Point(x, polished, costate)
-
-
-@jax.jit
-def polish_control(
-    problem: Problem, t: Any, x: Array, u: Array, costate: Array, integral: Array, force: Array
-) -> Float[Array, " m"]:
-    """One Newton step on H_u = 0 from a nearby `u`; `u` itself where that step is not small, or
-    where the `force` of constraints on the control would move it by more than `_FREE`."""
-
-    def stated(u: Array) -> Array:
-        h = hamiltonian(problem, t, x, u, costate)
-        return h + jnp.dot(integral, problem.integrands(t, x, u)) if len(integral) else h
-
-    gradient = jax.grad(stated)
-    h_u, h_uu = gradient(u), jax.jacfwd(gradient)(u)
-    # Double where: a singular H_uu must not leak NaN into derivatives of the branch not taken.
-    scale = jnp.max(jnp.abs(h_uu))
-    regular = (scale > 0) & jnp.all(force <= _FREE * scale * (1 + jnp.abs(u)))
-    safe = jnp.where(regular, h_uu, jnp.eye(u.shape[0], dtype=u.dtype))
-    step = solve(safe, h_u)
-    small = regular & jnp.all(jnp.abs(step) <= 1e-3 * (1 + jnp.abs(u)))
-    return jnp.where(small, u - jnp.where(small, step, 0.0), u)

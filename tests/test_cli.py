@@ -263,7 +263,7 @@ def test_configure(tmp_path, given):
 def test_progress_meters_fit_diffrax():
     import diffrax
 
-    from jaxguide.progress import NoProgress, Progress, RichProgress
+    from jaxguide.host.progress import NoProgress, Progress, RichProgress
 
     bar = RichProgress("x", delay=0.0)
     assert all(isinstance(m, Progress) for m in (NoProgress(), bar, diffrax.NoProgressMeter()))

@@ -15,7 +15,7 @@ import pytest
 from conftest import DoubleIntegrator, FreeTime, at
 
 import jaxguide as jg
-from jaxguide.montecarlo.sweep import cast
+from jaxguide.sweeping.sweep import cast
 
 START = (0.1, -0.1)
 simulate = eqx.filter_jit(jg.simulate)

@@ -15,10 +15,10 @@ from conftest import DoubleIntegrator
 from scipy import stats
 
 import jaxguide as jg
-from jaxguide.montecarlo import tiles as tiles_module
 from jaxguide.montecarlo.rollouts import apply, case_key, draw
 from jaxguide.montecarlo.statistics import wilson_bounds
-from jaxguide.montecarlo.tally import BINS, Tally, count_in, tile_moments
+from jaxguide.sweeping import tiles as tiles_module
+from jaxguide.sweeping.tally import BINS, Tally, count_in, tile_moments
 
 STD = np.array([0.02, 0.01])
 # Full gains held over a tenth bring the double integrator home exactly (the last two samples are

@@ -15,8 +15,8 @@ import pytest
 from conftest import DoubleIntegrator
 
 import jaxguide as jg
+from jaxguide.bounds import bounds_of
 from jaxguide.problem import (
-    bounds_of,
     initial_values,
     initially_free,
     start_value,

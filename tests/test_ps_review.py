@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import linprog, minimize
 
 from jaxguide import reproduce
-from jaxguide.nominal.mesh import collocation
+from jaxguide.nominal.direct.collocation import collocation
 from jaxguide.reproduce.ps_review import (
     boundary,
     covectors,

@@ -11,10 +11,11 @@ from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
 from jaxguide import problems
-from jaxguide.nominal import elimination, kkt, newton
-from jaxguide.nominal.mesh import FAMILIES, collocation, left_null
-from jaxguide.nominal.starting import edges
-from jaxguide.nominal.transcription import Primal, Rows, Scale, Transcription
+from jaxguide.nominal.direct import elimination, kkt, newton
+from jaxguide.nominal.direct.collocation import FAMILIES, collocation, left_null
+from jaxguide.nominal.direct.guess import edges
+from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.unknowns import Primal, Rows, Scale
 from jaxguide.problems import EarthMars
 
 

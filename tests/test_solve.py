@@ -16,7 +16,7 @@ from conftest import SMALL, DoubleIntegrator, ForcedLQR, FreeTime, Regulator, at
 from scipy import integrate, optimize
 
 import jaxguide as jg
-from jaxguide.nominal.shooting import _judge
+from jaxguide.nominal.indirect.shooting import _judge
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars.published import ANGLES, COSTATE_END, COSTATE_START, RADIUS
 

@@ -17,7 +17,7 @@ from conftest import DoubleIntegrator, FreeTime, at
 import jaxguide as jg
 from jaxguide import reproduce
 from jaxguide.neighboring.suboptimal import sensitivities
-from jaxguide.nominal.piecewise_linear import flown
+from jaxguide.nominal.parametric.extremal import flown
 from jaxguide.problems.lunar_launch import LunarLaunch, mission
 from jaxguide.reproduce.lunar_launch import flights, published, sections
 

@@ -22,10 +22,10 @@ import jaxguide as jg
 from jaxguide import cli, problems
 from jaxguide.cli import sweeping
 from jaxguide.export import export
-from jaxguide.montecarlo import flags
+from jaxguide.host import flags
 from jaxguide.montecarlo.rollouts import case_key, draw
-from jaxguide.montecarlo.written import as_written
 from jaxguide.report import html, write
+from jaxguide.sweeping.written import as_written
 
 pytest.importorskip("zarr")
 __all__ = ["mission"]  # a fixture

@@ -17,9 +17,9 @@ from test_montecarlo import Cliff, closed_loop
 from test_sweep_store import DISPERSIONS, TILE, assert_same, files, flown, mission, whole
 
 import jaxguide as jg
-from jaxguide.montecarlo import importance, ranking, tiles
 from jaxguide.montecarlo.rollouts import case_key
-from jaxguide.montecarlo.stopping import LOOK, fitting, rule
+from jaxguide.sweeping import importance, ranking, tiles
+from jaxguide.sweeping.stopping import LOOK, fitting, rule
 
 pytest.importorskip("zarr")
 __all__ = ["mission", "whole"]  # fixtures

@@ -18,7 +18,7 @@ import pytest
 from conftest import DoubleIntegrator
 
 import jaxguide as jg
-from jaxguide.montecarlo.store import stored
+from jaxguide.sweeping.store import stored
 
 zarr = pytest.importorskip("zarr")
 

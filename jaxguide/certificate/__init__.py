@@ -8,8 +8,8 @@ import equinox as eqx
 from jaxguide.certificate import checks, costly
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Certificate, Rows
-from jaxguide.nominal.wrappers import closed
 from jaxguide.trajectory import Extremal
+from jaxguide.transforms.endless import closed
 
 __all__ = ["Certificate", "certifier", "certify"]
 

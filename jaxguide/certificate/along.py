@@ -6,27 +6,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.nominal.conditions import endpoint_lagrangian
-from jaxguide.problem import Problem, hamiltonian
-from jaxguide.sizes import sizes_of
+from jaxguide.conditions.hamiltonian import endpoint_lagrangian
+from jaxguide.problem import Problem
 from jaxguide.spectral import interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal
-
-
-def constrained_hamiltonian(
-    problem: Problem, t: Array, x: Array, u: Array, costate: Array, held: Array
-) -> Float[Array, ""]:
-    """H with the multipliers `held` of path constraints, states, controls and integrals: review,
-    H bar."""
-    h, r = problem.path_constraints(t, x, u), problem.integrands(t, x, u)
-    return hamiltonian(problem, t, x, u, costate) + jnp.dot(held, jnp.concatenate([h, x, u, r]))
 
 
 class Along:
     """What several checks share, computed while they are traced."""
 
     def __init__(self, extremal: Extremal):
-        self.extremal, self.size = extremal, sizes_of(extremal)
+        self.extremal, self.size = extremal, extremal.sizes()
         t, m = extremal.t, extremal.multipliers
         gauss, weights = (jnp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
         self.gauss, self.weights, self.breaks = gauss, weights, extremal.breaks

@@ -9,18 +9,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxguide.certificate.along import Along, constrained_hamiltonian
-from jaxguide.certificate.bounded import bound_size, overstep, slackness
+from jaxguide.bounds import bound_size, overstep, slackness
+from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Rows
-from jaxguide.nominal.conditions import endpoint_lagrangian
-from jaxguide.problem import (
-    Problem,
+from jaxguide.conditions.hamiltonian import (
+    constrained_hamiltonian,
+    endpoint_lagrangian,
     hamiltonian,
-    initial_bounds,
-    initial_values,
-    initially_free,
-    is_free,
 )
+from jaxguide.problem import Problem, initial_bounds, initial_values, initially_free, is_free
 from jaxguide.spectral import legendre_matrix
 
 

@@ -7,7 +7,8 @@ from jaxtyping import Array, Bool
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Rows
 from jaxguide.neighboring.linearization import terminal_conditions
-from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, conjugate_ahead, solve_sweeps
+from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, solve_sweeps
+from jaxguide.neighboring.sufficiency import conjugate_ahead
 from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 

@@ -7,7 +7,7 @@ from typing import Any
 from cyclopts import App, Parameter
 from rich.text import Text
 
-from jaxguide.progress import RichProgress, waiting
+from jaxguide.host.progress import RichProgress, waiting
 
 app = App(
     name="jaxguide",

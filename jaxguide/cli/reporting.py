@@ -53,8 +53,8 @@ def compare(a: Path, b: Path, *, quantity: str = "miss", common: Common = Common
     quantity
         What to compare: "miss", "final_time", or a state at the end.
     """
-    from jaxguide.montecarlo.compare import compare as paired
-    from jaxguide.montecarlo.store import opened
+    from jaxguide.sweeping.compare import compare as paired
+    from jaxguide.sweeping.store import opened
 
     data = paired(opened(a), opened(b), quantity)
     table = Table("", "", box=None, show_header=False)

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxguide.cli.app import Common, Outcome, app, result_of, save, solved, written
-from jaxguide.progress import RichProgress, waiting
+from jaxguide.host.progress import RichProgress, waiting
 
 sweeps = App(name="sweep")
 app.command(sweeps)
@@ -78,13 +78,13 @@ def sweep(
 
     rule = None
     if stop is not None:
-        from jaxguide.montecarlo.stopping import rule as rule_of
+        from jaxguide.sweeping.stopping import rule as rule_of
 
         rule = rule_of(stop)
     if dispersions is None:
         spread = library.dispersions(name)
     else:
-        from jaxguide.montecarlo.written import dispersions_from
+        from jaxguide.sweeping.written import dispersions_from
 
         spread = dispersions_from(dispersions)
     with waiting(RichProgress(f"mission {name}")):
@@ -127,12 +127,12 @@ def _shown(data: dict[str, Any]) -> Table:
 def options_of_xla(command: Any, arguments: dict[str, Any]) -> None:
     """Before JAX starts: what makes flights fast; for a case again, what its store was made with,
     since nominal and gains would otherwise differ in their last digits."""
-    from jaxguide.montecarlo import flags
+    from jaxguide.host import flags
 
     if command is sweep:
         flags.set_for_flights()
     elif command is rerun:
-        from jaxguide.montecarlo.store import described
+        from jaxguide.sweeping.store import described
 
         with contextlib.suppress(ValueError):  # which the command itself will tell
             flags.take(described(arguments["store"])["sweep"].get("xla", ""))
@@ -155,7 +155,7 @@ def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = C
         Folder for the figure.
     """
     from jaxguide import problems as library
-    from jaxguide.montecarlo.store import stored
+    from jaxguide.sweeping.store import stored
 
     told, of_case = stored(store, case)
     name = told["label"]
@@ -164,7 +164,7 @@ def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = C
     import numpy as np
 
     import jaxguide as jg
-    from jaxguide.montecarlo.sweep import again, cast
+    from jaxguide.sweeping.sweep import again, cast
 
     mission = cast(mission, told["dtype"])
     dispersions, note = again(told, mission, library.dispersions(name), store)

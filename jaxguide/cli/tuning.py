@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxguide.cli.app import Common, Outcome, app, folder, save, written
-from jaxguide.progress import RichProgress, waiting
+from jaxguide.host.progress import RichProgress, waiting
 
 
 @app.command

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.laws.law import Lanes, lanes
+from jaxguide.laws.lanes import Lanes, lanes
 from jaxguide.types import RESULTS
 
 Rate = Callable[[Any, Any, Any], Any]  # (t, x, u) -> dx/dt

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxguide.bounds import bounds_of
 from jaxguide.flight.integrators import Adaptive, RungeKutta4, stacked
 from jaxguide.flight.mission import Mission
-from jaxguide.laws.law import Command, Law, SampleGrid
-from jaxguide.problem import bounds_of
+from jaxguide.laws.lanes import SampleGrid
+from jaxguide.laws.law import Command, Law
 from jaxguide.types import RESULTS
 
 # Of the sample interval: a law's time to go below which a flight is done (thesis: 1e-6 s of 4).

@@ -6,7 +6,8 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.law import Command, Lanes, lanes
+from jaxguide.laws.lanes import Lanes, lanes
+from jaxguide.laws.law import Command
 from jaxguide.types import RESULTS
 
 

@@ -7,23 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxguide.laws.lanes import Lanes, SampleGrid, lanes
 from jaxguide.types import RESULTS
-
-# A vector as a tuple of scalars: under `vmap` each becomes one contiguous array of flights, which
-# is what makes a batch of flights fast on a CPU.
-Lanes = tuple[Any, ...]
-
-
-def lanes(vector: Float[Array, " k"]) -> Lanes:
-    """The entries of `vector`, as a tuple."""
-    return tuple(vector[i] for i in range(vector.shape[0]))
-
-
-class SampleGrid(eqx.Module):
-    """Where a fixed-step flight will ask: sample times and the stage times within each sample."""
-
-    times: Float[Array, " sample"]
-    stages: Float[Array, "sample stage"]
 
 
 class Command(eqx.Module):

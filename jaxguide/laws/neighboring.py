@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.law import Command, Lanes, Law, SampleGrid, lanes
+from jaxguide.laws.lanes import Lanes, SampleGrid, lanes
+from jaxguide.laws.law import Command, Law
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.types import RESULTS, is_traced
 

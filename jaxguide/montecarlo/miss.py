@@ -5,8 +5,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxguide.bounds import bounds_of
 from jaxguide.flight.mission import Mission
-from jaxguide.problem import bounds_of
 
 
 def end_errors(mission: Mission, xf: Any, tf: Any) -> Float[Array, " q"]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxguide.bounds import bounds_of
 from jaxguide.linalg import solve
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.linearization import refuse_integrals, terminal_conditions
@@ -18,12 +19,12 @@ from jaxguide.neighboring.segmented import (
     SWEEPS,
     Sweep,
     canonical_at,
-    conjugate_ahead,
     gains_at,
     propagate,
     solve_sweeps,
 )
-from jaxguide.problem import bounds_of, is_free
+from jaxguide.neighboring.sufficiency import conjugate_ahead
+from jaxguide.problem import is_free
 from jaxguide.spectral import interpolate
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, is_traced, require_x64

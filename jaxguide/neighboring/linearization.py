@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxguide.bounds import bounds_of
+from jaxguide.conditions.hamiltonian import endpoint_lagrangian, hamiltonian
 from jaxguide.linalg import left_null_space, solve
-from jaxguide.nominal.conditions import endpoint_lagrangian
-from jaxguide.problem import Problem, bounds_of, hamiltonian, is_free, replace_parameters
+from jaxguide.problem import Problem, is_free, replace_parameters
 from jaxguide.trajectory import Extremal
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.linalg import solve
-from jaxguide.nominal import parameters as par
-from jaxguide.nominal.equality import KKTPoint, polished
+from jaxguide.nominal.parametric import flow as par
+from jaxguide.nominal.parametric.equality import KKTPoint, polished
 from jaxguide.problem import is_free
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced, require_x64

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxguide.nominal.phased import Phased, PhaseEnds
 from jaxguide.problem import Free, Problem
 from jaxguide.problems.reference import Reference
+from jaxguide.transforms.phased import Phased, PhaseEnds
 
 _RADIUS, _GRAVITY = 6_378_145.0, 3.986012e14  # of the Earth: m, m^3/s^2
 _ROTATION = 7.29211585e-5  # rad/s

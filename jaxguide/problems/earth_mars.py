@@ -12,7 +12,7 @@ from jaxguide.montecarlo.dispersions import Distribution, Normal
 from jaxguide.neighboring.gains import gain_schedule
 from jaxguide.problem import Problem
 from jaxguide.problems.reference import Reference
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.trig import sincos
 

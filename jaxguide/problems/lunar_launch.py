@@ -7,14 +7,15 @@ from jaxtyping import ArrayLike
 
 from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
+from jaxguide.laws.gain_interpolation import Interpolation, TimeToGoGains
 from jaxguide.laws.holds import History
-from jaxguide.laws.suboptimal import Interpolation, TimeToGo, TimeToGoGains
+from jaxguide.laws.suboptimal import TimeToGo
 from jaxguide.montecarlo.dispersions import Distribution, Normal
 from jaxguide.neighboring.suboptimal import suboptimal_gains
-from jaxguide.nominal.piecewise_linear import PiecewiseLinear
+from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear
 from jaxguide.problem import Free, Problem
 from jaxguide.problems.reference import Reference
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.trig import sincos
 

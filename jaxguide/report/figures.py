@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxguide.montecarlo.tally import edges_of_bins
 from jaxguide.plotting import COLOURS, WIDTH, align, ellipse, label, line, symbol
 from jaxguide.report.embed import INK
+from jaxguide.sweeping.tally import edges_of_bins
 
 SHOWN = 4000  # cases in a scatter; more only blacken it
 _ABREAST = 3  # panels of a figure

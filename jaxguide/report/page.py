@@ -6,9 +6,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from jaxguide.montecarlo import store as stores
 from jaxguide.report import figures
 from jaxguide.report.embed import drawn
+from jaxguide.sweeping import store as stores
 from jaxguide.types import RESULTS
 
 STYLE = (Path(__file__).parent / "page.css").read_text()

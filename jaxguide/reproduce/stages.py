@@ -4,7 +4,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 
-from jaxguide.progress import Progress
+from jaxguide.host.progress import Progress
 from jaxguide.reproduce.report import Report
 
 

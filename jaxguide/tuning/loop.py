@@ -12,8 +12,8 @@ import numpy as np
 import optax
 from jaxtyping import Array
 
+from jaxguide.host.progress import NoProgress, Progress
 from jaxguide.montecarlo.rollouts import case_key
-from jaxguide.progress import NoProgress, Progress
 from jaxguide.tuning.designs import checked, named, values
 from jaxguide.tuning.record import History, Tuned, on_host
 

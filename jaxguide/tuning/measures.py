@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxguide.bounds import bounds_of
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, sample_times
-from jaxguide.problem import bounds_of
 
 
 def endpoint_miss(mission: Mission, flight: Flight) -> Float[Array, ""]:

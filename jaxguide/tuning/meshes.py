@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.problem import bounds_of
+from jaxguide.bounds import bounds_of
 from jaxguide.spectral import differentiation_matrix, interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxguide.laws.suboptimal import Gains, Interpolation
+from jaxguide.laws.gain_interpolation import Gains, Interpolation
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
 from jaxguide.tuning.relaxation import thinned_weights
 

@@ -17,7 +17,7 @@ from jaxguide.laws.neighboring import NeighboringOptimal
 from jaxguide.montecarlo.rollouts import case_key
 from jaxguide.neighboring.gains import GainSchedule, gain_schedule
 from jaxguide.problems.earth_mars import CAP, SAMPLE_INTERVAL, EarthMars, dispersions, mission
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.tuning.counts import Count, counted
 from jaxguide.tuning.designs import Bounded

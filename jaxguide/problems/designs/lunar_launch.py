@@ -13,11 +13,12 @@ from jaxtyping import Array, Float
 from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight
+from jaxguide.host.compilation import quick_compilation
 from jaxguide.laws.holds import History
 from jaxguide.laws.suboptimal import TimeToGo
 from jaxguide.montecarlo.rollouts import case_key
 from jaxguide.neighboring.suboptimal import suboptimal_gains
-from jaxguide.nominal.piecewise_linear import PiecewiseLinear
+from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear
 from jaxguide.problems.lunar_launch import (
     POWERS,
     QUIET,
@@ -25,7 +26,7 @@ from jaxguide.problems.lunar_launch import (
     LunarLaunch,
     dispersions,
 )
-from jaxguide.solving import quick_compilation, solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.flown import Flown

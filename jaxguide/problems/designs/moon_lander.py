@@ -10,9 +10,10 @@ import numpy as np
 import optax
 from jaxtyping import Array
 
-from jaxguide.nominal.pseudospectral import Pseudospectral
+from jaxguide.host.compilation import quick_compilation
+from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.problems.vehicles import MoonLander
-from jaxguide.solving import quick_compilation, solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.meshes import mesh_error

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxguide.montecarlo.sweep import sweep
+from jaxguide.host.progress import NoProgress, Progress
 from jaxguide.neighboring.gains import gain_schedule
 from jaxguide.problems import earth_mars
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
-from jaxguide.progress import NoProgress, Progress
 from jaxguide.reproduce.earth_mars import sections
 from jaxguide.reproduce.earth_mars.collocation import (
     gain_errors,
@@ -29,7 +28,8 @@ from jaxguide.reproduce.earth_mars.flights import (
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.reproduce.report import Report
 from jaxguide.reproduce.stages import Stages
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
+from jaxguide.sweeping.sweep import sweep
 
 SWEEP_CASES = 10_000
 

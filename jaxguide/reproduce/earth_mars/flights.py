@@ -12,14 +12,14 @@ from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, Prepared, simulate
 from jaxguide.laws.holds import History
-from jaxguide.laws.law import SampleGrid
+from jaxguide.laws.lanes import SampleGrid
 from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
 from jaxguide.neighboring.gains import GainSchedule
-from jaxguide.nominal.shooting import Shooting
+from jaxguide.nominal.indirect.shooting import Shooting
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
 from jaxguide.reproduce.earth_mars.collocation import at
 from jaxguide.reproduce.earth_mars.published import CASES
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 
 METHOD = Shooting(starts=4)  # one compiled program serves the nominal and the six re-solves

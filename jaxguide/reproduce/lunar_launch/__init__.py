@@ -7,16 +7,15 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.montecarlo.sweep import sweep
+from jaxguide.host.progress import NoProgress, Progress
 from jaxguide.neighboring.suboptimal import (
     SuboptimalSchedule,
     remaining_optimum,
     suboptimal_gains,
 )
-from jaxguide.nominal.piecewise_linear import PiecewiseLinear
+from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear
 from jaxguide.problems import lunar_launch
 from jaxguide.problems.lunar_launch import LunarLaunch
-from jaxguide.progress import NoProgress, Progress
 from jaxguide.reproduce.lunar_launch import sections
 from jaxguide.reproduce.lunar_launch.flights import (
     ends,
@@ -30,7 +29,8 @@ from jaxguide.reproduce.lunar_launch.flights import (
 from jaxguide.reproduce.lunar_launch.improvements import place_nodes, variants
 from jaxguide.reproduce.report import Report
 from jaxguide.reproduce.stages import Stages
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
+from jaxguide.sweeping.sweep import sweep
 
 SWEEP_CASES = 100_000
 

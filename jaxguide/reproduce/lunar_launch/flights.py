@@ -13,16 +13,18 @@ from jaxguide.certificate import certifier
 from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, simulate
+from jaxguide.laws.gain_interpolation import LinearGains
 from jaxguide.laws.law import OpenLoop
-from jaxguide.laws.suboptimal import LinearGains, NeighboringSuboptimal
+from jaxguide.laws.suboptimal import NeighboringSuboptimal
 from jaxguide.neighboring.suboptimal import suboptimal_gains
-from jaxguide.nominal.parameters import pack
-from jaxguide.nominal.piecewise_linear import PiecewiseLinear, flown
-from jaxguide.nominal.state_as_time import StateAsTime
+from jaxguide.nominal.parametric.extremal import flown
+from jaxguide.nominal.parametric.flow import pack
+from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear
 from jaxguide.problems.lunar_launch import LunarLaunch, mission
 from jaxguide.reproduce.lunar_launch.published import FINAL_TIME, TABLE_5_3, TABLE_5_4, THETA
-from jaxguide.solving import solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
+from jaxguide.transforms.state_as_time import StateAsTime
 
 CASES = TABLE_5_3 + TABLE_5_4
 _NAMES = ["5.3"] * len(TABLE_5_3) + ["5.4"] * len(TABLE_5_4)

@@ -8,11 +8,12 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxguide.flight.mission import Mission
-from jaxguide.laws.suboptimal import LinearGains
-from jaxguide.nominal.piecewise_linear import PiecewiseLinear
+from jaxguide.host.compilation import quick_compilation
+from jaxguide.laws.gain_interpolation import LinearGains
+from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear
 from jaxguide.problems.lunar_launch import LunarLaunch, mission
 from jaxguide.reproduce.lunar_launch.flights import TARGET, fly_cases, thesis_mission
-from jaxguide.solving import quick_compilation, solve
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.loop import tune

@@ -6,7 +6,7 @@ rates, computed.
 import contextlib
 from pathlib import Path
 
-from jaxguide.progress import NoProgress, Progress
+from jaxguide.host.progress import NoProgress, Progress
 from jaxguide.reproduce.ps_review import sections
 from jaxguide.reproduce.report import Report
 from jaxguide.reproduce.stages import Stages

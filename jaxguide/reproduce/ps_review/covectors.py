@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxguide.nominal.mesh import Collocation, collocation, left_null
+from jaxguide.nominal.direct.collocation import Collocation, collocation, left_null
 from jaxguide.reproduce.ps_review.lq import Tracking, discretise, end_rows
 from jaxguide.spectral.grids import evaluation
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxguide.nominal.mesh import Collocation
+from jaxguide.nominal.direct.collocation import Collocation
 from jaxguide.spectral.grids import evaluation, grid
 
 Function = Callable[[np.ndarray], np.ndarray]

@@ -1,0 +1,110 @@
+"""How large each quantity of an extremal is: what errors are relative to, in any units."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.bounds import largest_bound, positive
+from jaxguide.problem import Problem
+
+# A state below this share of what the others would move it by is at rest: its size is `_MOVED` of
+# that.
+_REST, _MOVED = 1e-6, 1e-3
+_TERMS = 1e-3  # of the terms of H, where they cancel
+
+
+class Sizes(NamedTuple):
+    """In user units, all above zero."""
+
+    x: Float[Array, " n"]
+    u: Float[Array, " m"]
+    t: Float[Array, ""]  # the horizon
+    cost: Float[Array, ""]  # what states and costates together are worth
+    hamiltonian: Float[Array, ""]
+    path: Float[Array, " p"]
+    end: Float[Array, " q"]
+
+    @property
+    def costate(self) -> Float[Array, " n"]:
+        return self.cost / self.x
+
+
+def sizes_of(
+    problem: Problem,
+    t: Float[Array, " node"],
+    x: Float[Array, "node n"],
+    u: Float[Array, "node m"],
+    costate: Float[Array, "node n"],
+    integral: Float[Array, " r"],
+) -> Sizes:
+    """Of a state the largest value, or where it rests what the others would move it by; of
+    constraints what a change of everything by its size amounts to, or a bound.
+
+    `integral`: the multipliers of the integral constraints.
+    """
+    horizon = t[-1] - t[0]
+    u_size = jnp.max(jnp.abs(u), axis=0)
+    u_size = positive(
+        jnp.where(u_size > 0, u_size, largest_bound(problem.control_bounds, problem.m))
+    )
+    x_size = state_sizes(problem, t, x, u)
+    z = jnp.concatenate([x_size, u_size])
+    along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))
+    path = jnp.max(_known(along(problem.path_constraints)) @ z, axis=0, initial=0.0)
+    path = jnp.maximum(path, largest_bound(problem.path_bounds, path.shape[0]))
+
+    end = end_sizes(problem, t, x, x_size)
+    worth = jnp.max(jnp.max(jnp.abs(costate), axis=0) * x_size)
+    e_x = jax.grad(problem.endpoint_cost, argnums=1)(x[0], x[-1], t[0], t[-1])
+    cost = positive(worth + jnp.max(jnp.abs(e_x) * x_size))
+
+    f = jax.vmap(problem.dynamics)(t, x, u)
+    F = jax.vmap(problem.running_cost)(t, x, u)
+    gain = jax.vmap(problem.integrands)(t, x, u) @ integral
+    H = F + gain + jnp.sum(costate * f, axis=1)
+    terms = jnp.abs(F) + jnp.sum(jnp.abs(costate * f), axis=1)
+    hamiltonian = positive(jnp.max(jnp.abs(H)) + _TERMS * jnp.max(terms))
+    return Sizes(x_size, u_size, horizon, cost, hamiltonian, positive(path), end)
+
+
+def end_sizes(
+    problem: Problem,
+    t: Float[Array, " node"],
+    x: Float[Array, "node n"],
+    x_size: Float[Array, " n"],
+) -> Float[Array, " q"]:
+    """Sizes of the endpoint constraints, from those of the states."""
+    e = lambda x0, xf, times: problem.endpoint_constraints(x0, xf, times[0], times[1])
+    slopes = jax.jacfwd(e, argnums=(0, 1, 2))(x[0], x[-1], jnp.stack([t[0], t[-1]]))
+    horizon = jnp.broadcast_to(t[-1] - t[0], (2,))
+    end = _known(jnp.concatenate(slopes, axis=1)) @ jnp.concatenate([x_size, x_size, horizon])
+    return positive(jnp.maximum(end, largest_bound(problem.endpoint_bounds, end.shape[0])))
+
+
+def state_sizes(
+    problem: Problem,
+    t: Float[Array, " node"],
+    x: Float[Array, "node n"],
+    u: Float[Array, "node m"],
+) -> Float[Array, " n"]:
+    """Sizes of the states: see `sizes_of`."""
+    span, most = jnp.max(jnp.abs(x), axis=0), jnp.max(jnp.abs(u), axis=0)
+    slopes = jax.vmap(jax.jacfwd(_joined(problem.dynamics, problem.n), argnums=1))(t, _stack(x, u))
+    moved = _known(slopes) @ jnp.concatenate([span, most])
+    # The median: at the end of an infinite horizon rates grow beyond all bounds.
+    moved = (t[-1] - t[0]) * jnp.median(moved, axis=0)
+    return positive(jnp.where(span >= _REST * moved, span, _MOVED * moved))
+
+
+def _joined(f: Any, n: int) -> Any:
+    return lambda t, z: f(t, z[:n], z[n:])
+
+
+def _stack(x: Array, u: Array) -> Array:
+    return jnp.concatenate([x, u], axis=1)
+
+
+def _known(slopes: Array) -> Array:
+    return jnp.where(jnp.isfinite(slopes), jnp.abs(slopes), 0.0)

@@ -1,0 +1,98 @@
+"""The Newton system of a transcription: its matrix by parts, its right-hand side, their product.
+
+Nothing is factorised here: `kkt` does that.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.nominal.direct.transcription import Ends, Nodes, Transcription
+from jaxguide.nominal.direct.unknowns import Primal, Rows
+
+COMPLIANCE = 1e-8  # of path constraints: an equality is a spring of stiffness 1/this
+
+
+class System(NamedTuple):
+    """The matrix: derivatives at the iterate, and the barrier's curvature."""
+
+    nodes: Nodes
+    ends: Ends
+    node_hessian: Float[Array, "segment node in in"]
+    end_hessian: Float[Array, "in in"]
+    sigma: Primal  # z/(w - l) + z/(u - w)
+    given: Primal  # bool: entries that must not move
+
+
+class Load(NamedTuple):
+    """The right-hand side, negated: the gradient without its constraint terms, and residuals."""
+
+    force: Primal
+    residual: Rows
+
+
+class Step(NamedTuple):
+    """Change of the unknowns, and the multipliers after it."""
+
+    primal: Primal
+    dual: Rows
+
+
+def product(program: Transcription, system: System, delta: Array, step: Step) -> Load:
+    """The matrix times a step, without elimination: what refinement measures by."""
+    n = program.sizes.n
+    dw, y = step
+    J, rule = system.nodes.jacobian, program.rule
+    A, B = (jnp.asarray(a, delta.dtype) for a in (rule.A, rule.B))
+    dq, db = program.inputs(dw), program.end_inputs(dw)
+    on_q, on_b, on_support = forces(program, system.nodes, system.ends, y, 0.0)
+    on_q = on_q + jnp.einsum("skab,skb->ska", system.node_hessian, dq)
+    on_b = on_b + system.end_hessian @ db
+    force = gather(program, dw, on_q, on_b, on_support)
+    force = force._replace(u=force.u + program.roughness(dw.u))
+    springs = lambda f, s, d, g: jnp.where(g, 0.0, f + (s + delta) * d)
+    own = jax.tree_util.tree_map(springs, force, system.sigma, dw, system.given)
+    slack = lambda y, s, d, g: jnp.where(g, 0.0, -y + s * d)
+    force = own._replace(
+        path=slack(y.path, system.sigma.path, dw.path, system.given.path),
+        end=slack(y.end, system.sigma.end, dw.end, system.given.end),
+    )
+    e_b = system.ends.jacobian[1:]
+    defect = jnp.einsum("rp,spn->srn", A, program.support(dw))
+    defect = defect - jnp.einsum("rk,skna,ska->srn", B, J[:, :, :n], dq)
+    path = jnp.einsum("skha,ska->skh", J[:, :, n + 1 :], dq) - dw.path - COMPLIANCE * y.path
+    return Load(force, Rows(defect, path, e_b @ db - dw.end))
+
+
+def forces(
+    program: Transcription, nodes: Nodes, ends: Ends, y: Rows, cost: float
+) -> tuple[Array, Array, Array]:
+    """Derivatives of `cost` f + y^T c by the nodes' inputs, the endpoint inputs and, of A X alone,
+    the support points."""
+    n = program.sizes.n
+    weights = program.node_weights(y).at[:, :, n].set(cost)
+    on_q = jnp.einsum("sko,skoa->ska", weights, nodes.jacobian)
+    on_b = cost * ends.jacobian[0] + y.end @ ends.jacobian[1:]
+    A = jnp.asarray(program.rule.A, y.defect.dtype)
+    return on_q, on_b, jnp.einsum("rp,srn->spn", A, y.defect)
+
+
+def gather(
+    program: Transcription, like: Primal, on_q: Array, on_b: Array, on_support: Array
+) -> Primal:
+    """`forces` on the unknowns themselves."""
+
+    def spread(w: Primal) -> tuple[Array, Array, Array]:
+        return program.inputs(w), program.end_inputs(w), program.support(w)
+
+    return jax.linear_transpose(spread, like)((on_q, on_b, on_support))[0]
+
+
+@jax.jit
+def gradient(program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Rows) -> Primal:
+    """Of the Lagrangian f + y^T c, from Jacobians at hand."""
+    on_unknowns = gather(program, w, *forces(program, nodes, ends, y, 1.0))
+    on_controls = on_unknowns.u + program.roughness(w.u)
+    return on_unknowns._replace(u=on_controls, path=-y.path, end=-y.end)

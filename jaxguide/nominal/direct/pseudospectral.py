@@ -1,0 +1,343 @@
+"""`jg.Pseudospectral`: Problem P solved directly on a mesh, costates by covector mapping.
+
+**Source:** Ross & Karpenko, review (2012), sections 3 and 4.
+"""
+
+import dataclasses
+import math
+import os
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxguide.host.lapack import single_threaded_lapack
+from jaxguide.nominal.defects import segment_errors
+from jaxguide.nominal.direct import interior_point
+from jaxguide.nominal.direct.collocation import FAMILIES, collocation
+from jaxguide.nominal.direct.covectors import to_extremal
+from jaxguide.nominal.direct.guess import edges, from_extremal, random_guess, straight_guess
+from jaxguide.nominal.direct.implicit import sensitivity
+from jaxguide.nominal.direct.limits import Bounds, bounds
+from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.units import designer_units, unit_scale
+from jaxguide.nominal.direct.unknowns import Arcwise
+from jaxguide.nominal.direct.warm import blank_duals, duals, fits
+from jaxguide.nominal.guesses import is_key
+from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
+from jaxguide.trajectory import Extremal
+from jaxguide.transforms.endless import Endless
+from jaxguide.transforms.integrals import with_integrals
+from jaxguide.transforms.relaxed import relaxed, rewrapped
+from jaxguide.types import RESULTS, is_traced
+
+_MOST_NODES = 512
+
+
+def _hashable(numbers: Any) -> Any:
+    """A number, or a tuple of the numbers of any sequence: what a static field can hold."""
+    numbers = np.asarray(numbers, float)
+    return tuple(numbers.tolist()) if numbers.ndim else float(numbers)
+
+
+class Pseudospectral(eqx.Module):
+    """Direct collocation on one or many segments, solved by the interior-point method.
+
+    **Arguments:**
+
+    - `grid`: "lgl" (the review's choice; for one segment: on many, its two equations at each
+      shared node cost accuracy), "cgl", "lgr-left", "lgr-right" (default) or "lg".
+    - `nodes`: collocation nodes a segment. `segments`: how many, of equal length; or instead
+      `fractions`, the break points of the horizon from 0 to 1. `knots`: which of the inner ones
+      (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
+      others keep their places between them. For switches, kinks and junctions.
+    - `arcwise`: what is known of each segment's arc: controls at bounds, singular, and so on.
+    - `smoothing`: of controls known to be singular, a number or (m,): weights of the squares of the
+      upper half of their Legendre coefficients, as in `Arcwise.smooth`; of the order of 100.
+    - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
+      (n,): delta^N of problem B^N. Zero: not at all.
+    - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
+      Radau nodes that leave out s = 1, where the state vanishes unless the Problem has endpoint
+      constraints of its own.
+    - `starts`, `seed`: how many guesses to solve from, the first straight and the others random,
+      for the best of what they find. Under a trace: one.
+    - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
+    - `refinements`: how often `solve` may raise the number of nodes or segments (it also moves
+      breaks, and frees the junctions of a clear structure) until each segment's defect between the
+      nodes, relative to the state's span, is below `mesh_tolerance`. Zero: one solve. Under a
+      trace and in `solve_batch` the mesh stays, and a solution that it does not resolve so far is
+      `RESULTS.underresolved`; zero refinements take it as it is.
+    - `log`: print the designer units and the optimiser's iterations: objective, worst constraint,
+      scaled error, barrier, regularisation, step; "r" marks restoration, "e" an estimate of the
+      multipliers.
+    - `quick`: compile in half the time, for programs a fifth slower. False where one mesh is solved
+      on many times. Under a trace whoever compiles decides.
+
+    **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells. Derivatives
+    by parameters and by `fractions` are implicit, of the discrete solution.
+
+    **Source:** review, eqs (10)-(16), (21), (23); Waechter & Biegler (2006).
+    """
+
+    grid: str = eqx.field(static=True, default="lgr-right")
+    nodes: int = eqx.field(static=True, default=6)
+    segments: int = eqx.field(static=True, default=12)
+    fractions: Any = None
+    knots: tuple[int, ...] = eqx.field(static=True, default=())
+    arcwise: Arcwise | None = None
+    smoothing: Any = eqx.field(static=True, default=0.0, converter=_hashable)
+    relaxation: Any = eqx.field(static=True, default=0.0, converter=_hashable)
+    time_scale: float = eqx.field(static=True, default=1.0)
+    starts: int = eqx.field(static=True, default=1)
+    seed: int = eqx.field(static=True, default=0)
+    tolerance: float = eqx.field(static=True, default=1e-9)
+    max_iterations: int = eqx.field(static=True, default=500)
+    refinements: int = eqx.field(static=True, default=4)
+    mesh_tolerance: float = eqx.field(static=True, default=1e-7)
+    log: bool = eqx.field(static=True, default=False)
+    quick: bool = eqx.field(static=True, default=True)
+    accuracy = 1e-6  # that its certificates ask for
+
+    def __check_init__(self):
+        if self.grid not in FAMILIES:
+            raise ValueError(
+                f"Pseudospectral: grid is {self.grid!r}; choose one of {', '.join(FAMILIES)}."
+            )
+        if self.segments < 1:
+            raise ValueError(f"Pseudospectral: segments is {self.segments}; give at least 1.")
+        if self.max_iterations < 1:
+            raise ValueError(f"Pseudospectral: max_iterations is {self.max_iterations}.")
+        if self.starts < 1:
+            raise ValueError(f"Pseudospectral: starts is {self.starts}; give at least 1.")
+        if self.nodes > _MOST_NODES:
+            raise ValueError(
+                f"Pseudospectral: nodes is {self.nodes}; give at most {_MOST_NODES}, with which "
+                "interpolation still keeps its digits, and more segments."
+            )
+        if self.refinements < 0:
+            raise ValueError(f"Pseudospectral: refinements is {self.refinements}; need at least 0.")
+        for name in ("tolerance", "mesh_tolerance"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(
+                    f"Pseudospectral: {name} is {getattr(self, name)}; give one in (0, 1)."
+                )
+        if self.fractions is not None and not is_traced(self.fractions):
+            given = np.asarray(self.fractions, float)
+            ends = given.ndim == 1 and given.size > 1 and (given[0], given[-1]) == (0.0, 1.0)
+            if not ends or not np.all(np.diff(given) > 0):
+                raise ValueError(
+                    f"Pseudospectral: fractions is {self.fractions}; give break points that "
+                    "ascend from 0 to 1, such as (0, 0.3, 1)."
+                )
+        breaks = self.segments if self.fractions is None else np.shape(self.fractions)[0] - 1
+        if any(not 0 < k < breaks for k in self.knots) or len(set(self.knots)) < len(self.knots):
+            raise ValueError(
+                f"Pseudospectral: knots is {self.knots}; name each inner break once, from 1 to "
+                f"{breaks - 1}."
+            )
+        for name in ("relaxation", "smoothing"):
+            if not np.all(np.asarray(getattr(self, name)) >= 0):
+                raise ValueError(
+                    f"Pseudospectral: {name} is {getattr(self, name)}; need at least 0."
+                )
+        if not self.time_scale > 0:
+            raise ValueError(f"Pseudospectral: time_scale is {self.time_scale}; give one above 0.")
+        collocation(self.grid, self.nodes)
+
+    def check_fields(self, problem: Problem) -> None:
+        """Nothing that a Problem may hold is beyond it. Host only."""
+
+    def check(self, problem: Problem) -> None:
+        """Refuses a mesh that memory will not hold, or that integrals do not go with. Host only.
+
+        **Raises:** `ValueError`, with the estimate.
+        """
+        if len(collocation(self.grid, self.nodes).extra) and count(problem, "integrands"):
+            raise ValueError(
+                f"Pseudospectral: grid {self.grid!r} collocates at both ends, one equation a "
+                f"segment more than an integral has unknowns, and {type(problem).__name__} has "
+                "integral constraints; use 'lgr-right', 'lgr-left' or 'lg'."
+            )
+        need, have = self.memory(problem), _physical_memory()
+        if need > have:
+            segments = self.segments if self.fractions is None else len(self.fractions) - 1
+            raise ValueError(
+                f"Pseudospectral: {segments} segments of {self.nodes} nodes with {problem.n} "
+                f"states and {problem.m} controls need some {need / 1e9:.3g} GB of the "
+                f"{have / 1e9:.3g} GB here; use fewer nodes and more segments."
+            )
+
+    def memory(self, problem: Problem) -> float:
+        """Bytes of a Newton step, roughly: a segment's factors, the directions that its nodes'
+        inputs take, and a few copies."""
+        segments = self.segments if self.fractions is None else len(self.fractions) - 1
+        n, m, C = problem.n, problem.m, float(self.nodes)
+        basis = (C + 1) * n + C * m
+        directions = 2 * n + C * m + 2
+        entries = 2 * basis**2 + 4 * basis * directions + directions**2
+        return 8 * segments * (3 * entries + C * (n + m + 2) ** 2 * 4)
+
+    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
+        """The extremal on the fixed mesh, without host checks; `solve` wraps this. Where the method
+        would refine, but no host can, one short of `mesh_tolerance` is `RESULTS.underresolved`."""
+        extremal = finished(problem, *self.prepared(problem, guess), certifier)
+        if not self.refinements:
+            return extremal
+        resolved = jnp.max(segment_errors(extremal)) <= self.mesh_tolerance
+        good = extremal.result == RESULTS.successful
+        result = RESULTS.where(good & ~resolved, RESULTS.underresolved, extremal.result)
+        return dataclasses.replace(extremal, result=result)
+
+    def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
+        """Designer units: what the solver takes for one of each state, control, time, constraint
+        and objective, in user units, from bounds and guess. Also printed by `log`. Host only."""
+        scale = _scale(self, with_array_leaves(problem), guess)
+        numbered = lambda what, k: [f"{what} {i}" for i in range(k)]
+        paths = [".".join(map(str, path)) for path in problem.parameter_paths()]
+        q = endpoint_count(problem)
+        named = (
+            (problem.state_names, scale.x),
+            (problem.control_names, scale.u),
+            (("time",), scale.t[None]),
+            (paths, scale.p),
+            (numbered("path constraint", scale.path.shape[0]), scale.path),
+            (numbered("endpoint constraint", q), scale.end),
+            (("objective",), scale.objective[None]),
+        )
+        return {k: float(v) for names, values in named for k, v in zip(names, values, strict=False)}
+
+    def whole(self, problem: Problem) -> Problem:
+        """`problem` with what the transcription needs besides: integrals, relaxed dynamics."""
+        whole = with_integrals(problem)
+        if not np.any(np.asarray(self.relaxation)):
+            return whole
+        delta = jnp.broadcast_to(jnp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
+        return relaxed(whole, jnp.pad(delta, (0, whole.n - problem.n)))
+
+    def _arcwise(self, problem: Problem, whole: Problem, segments: int) -> Arcwise | None:
+        """`arcwise`, `smoothing` added, with entries for what `whole` has besides."""
+        known = self.arcwise
+        if np.any(np.asarray(self.smoothing)):
+            known = Arcwise.blank(segments, problem) if known is None else known
+            weights = jnp.asarray(self.smoothing, jnp.result_type(float))
+            weights = known.smooth + jnp.broadcast_to(weights, (problem.m,))[None]
+            known = eqx.tree_at(lambda a: a.smooth, known, weights)
+        if known is None:
+            return None
+        more = lambda a, k: jnp.pad(a, (*((0, 0),) * (a.ndim - 1), (0, k - a.shape[-1])))
+        return Arcwise(
+            more(known.held, whole.m),
+            more(known.smooth, whole.m),
+            more(known.released, whole.n),
+            known.unpathed,
+        )
+
+    def prepared(
+        self, problem: Problem, guess: Any
+    ) -> tuple[Transcription, interior_point.Start, interior_point.Options]:
+        """The transcription in designer units, where the search starts, and how."""
+        single_threaded_lapack()
+        dtype = jnp.result_type(float)
+        # Where the search starts does not matter to the solution; where the breaks are, does.
+        problem = jax.lax.stop_gradient(problem)
+        whole = self.whole(problem)
+        if self.fractions is None:
+            fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
+        else:
+            fractions = jnp.asarray(self.fractions, dtype)
+        unit = unit_scale(whole, len(self.knots))
+        # At the end of an infinite horizon time stands still: no node may lie there.
+        family = "lgr-left" if isinstance(problem, Endless) else self.grid
+        program = Transcription(
+            whole, unit, edges(fractions, self.knots), family, self.nodes,
+            self._arcwise(problem, whole, fractions.shape[0] - 1), self.log,
+        )  # fmt: skip
+        if guess is None:
+            w = straight_guess(program, fractions, self.knots)
+        elif is_key(guess):
+            w = random_guess(program, fractions, self.knots, guess)
+        else:
+            w = from_extremal(program, fractions, self.knots, problem, guess)
+        scale = designer_units(program, w)
+        program = eqx.tree_at(lambda p: p.scale, program, scale)
+        w = jax.tree_util.tree_map(jnp.divide, w, program.units)
+        node, end = program.values(w)
+        w = w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
+        start = interior_point.Start(w, *blank_duals(program, w))
+        # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
+        mu, push, warm = 0.1, 1e-2, False
+        if isinstance(guess, Extremal):
+            mu, push = 1e-3, 1e-3
+            if fits(program, guess):
+                start, warm = start._replace(**duals(program, fractions, w, guess)), True
+                mu, push = 1e-6, 1e-6
+        options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
+        still, start = jax.lax.stop_gradient((program, start))
+        program = eqx.tree_at(lambda p: p.edges, still, program.edges)
+        return program, start, jax.tree_util.tree_map(jnp.asarray, options)
+
+
+def finished(
+    problem: Problem,
+    program: Transcription,
+    start: interior_point.Start,
+    options: interior_point.Options,
+    certifier: Any,
+) -> Extremal:
+    """What the optimiser makes of `Pseudospectral.prepared`: one program for every guess, break
+    and scale."""
+    whole = rewrapped(program.problem, problem)
+    solution = _solved((whole, program.edges), program, start, options)
+    program = _stated(program, (whole, program.edges))
+    return to_extremal(problem, program, bounds(program), solution, certifier)
+
+
+@eqx.filter_jit
+def _scale(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
+    return method.prepared(problem, guess)[0].scale
+
+
+def _physical_memory() -> float:
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):  # where the system does not say
+        return math.inf
+
+
+@jax.custom_batching.sequential_vmap
+def _one_at_a_time(
+    program: Transcription,
+    box: Bounds,
+    start: interior_point.Start,
+    options: interior_point.Options,
+) -> interior_point.Solution:
+    """Under `vmap` one problem after another: batched LAPACK may hang on CPU and gains nothing."""
+    return interior_point.minimise(program, box, start, options)
+
+
+def _stated(program: Transcription, given: tuple[Problem, Array]) -> Transcription:
+    """`program` of another problem, on other breaks."""
+    return eqx.tree_at(lambda p: (p.problem, p.edges), program, given)
+
+
+@eqx.filter_custom_jvp
+def _solved(
+    given: tuple[Problem, Array],
+    program: Transcription,
+    start: interior_point.Start,
+    options: interior_point.Options,
+) -> interior_point.Solution:
+    """The solution for `given`, a problem and the breaks of the mesh, in the units of `program`."""
+    program = _stated(program, given)
+    return _one_at_a_time(program, bounds(program), start, options)
+
+
+@_solved.def_jvp
+def _(primals: Any, tangents: Any) -> Any:
+    """The implicit function theorem on the conditions that the optimiser met, never its steps."""
+    given, program, start, options = primals
+    solution = _solved(given, program, start, options)
+    return solution, sensitivity(_stated(program, given), solution, tangents[0])

@@ -1,0 +1,55 @@
+"""Shooting's unknowns, and what they must meet at the ends: 2002 paper eqs (3), (8), (9)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.bounds import bounds_of
+from jaxguide.conditions.canonical import optimal_hamiltonian
+from jaxguide.conditions.hamiltonian import endpoint_lagrangian
+from jaxguide.problem import Problem, initial_values, initially_free, is_free
+
+
+class Unknowns(NamedTuple):
+    """What shooting solves for: state and costate at the start of each arc, nu, free times."""
+
+    starts: Float[Array, "arc two_n"]
+    nu: Float[Array, " q"]
+    t0: Float[Array, " chosen"]
+    tf: Float[Array, " chosen"]
+
+
+def horizon(problem: Problem, z: Unknowns) -> tuple[Array, Array]:
+    """Initial and final time, chosen or given."""
+    dtype = z.starts.dtype
+    t0 = z.t0[0] if is_free(problem.initial_time) else jnp.asarray(problem.initial_time, dtype)
+    tf = z.tf[0] if is_free(problem.final_time) else jnp.asarray(problem.final_time, dtype)
+    return t0, tf
+
+
+def boundary_residual(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:
+    """Everything that must vanish: initial state, continuity, eq. (3), transversality (8), (9).
+
+    With H minimised, eq. (8) reads lambda(tf) = +dEbar/dx; a free initial component has
+    lambda(t0) = -dEbar/dx0; a free final time H(tf) = -dEbar/dtf.
+    """
+    n = problem.n
+    t0, tf = horizon(problem, z)
+    x0, lam0 = z.starts[0, :n], z.starts[0, n:]
+    xf, lamf = ends[-1, :n], ends[-1, n : 2 * n]
+    given, free = initial_values(problem, z.starts.dtype), initially_free(problem)
+    g_x0, g_xf, g_t0, g_tf = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))(
+        problem, z.nu, x0, xf, t0, tf
+    )
+    start = jnp.where(jnp.asarray(free), lam0 + g_x0, x0 - given)
+    e = problem.endpoint_constraints(x0, xf, t0, tf)
+    e = e - bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)[0]
+    joined = (ends[:-1, : 2 * n] - z.starts[1:]).reshape(-1)
+    parts = [start, joined, e, lamf - g_xf]
+    if is_free(problem.final_time):
+        parts.append((optimal_hamiltonian(problem, tf, ends[-1]) + g_tf)[None])
+    if is_free(problem.initial_time):
+        parts.append((optimal_hamiltonian(problem, t0, z.starts[0]) - g_t0)[None])
+    return jnp.concatenate(parts)

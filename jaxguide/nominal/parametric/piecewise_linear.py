@@ -1,0 +1,249 @@
+"""`jg.PiecewiseLinear`: the control as a parameter vector, optimised (thesis, chapter 2)."""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.bounds import bounds_of
+from jaxguide.nominal.parametric import flow as par
+from jaxguide.nominal.parametric.equality import KKTPoint, minimise, polished, residual
+from jaxguide.nominal.parametric.extremal import flown
+from jaxguide.problem import (
+    Problem,
+    count,
+    endpoint_count,
+    initially_free,
+    is_free,
+    start_control,
+    start_value,
+)
+from jaxguide.trajectory import Extremal
+from jaxguide.types import RESULTS, is_traced
+
+_ITERATIONS = 100
+_TOLERANCE = 1e-12  # scaled KKT residual up to which a solution counts as converged
+
+
+class PiecewiseLinear(eqx.Module):
+    """Suboptimal control: node values of a piecewise-linear control, and a free final time, that
+    minimise the cost subject to the endpoint constraints, eqs (2.5)-(2.13).
+
+    The flow is by Dormand-Prince steps of order eight, `degree` to an interval; the parameters by
+    Newton on the KKT system with exact second derivatives, from a constant control and from random
+    straight ones. Derivatives, in node positions too, are implicit.
+
+    **Arguments:**
+
+    - `nodes`: how many, evenly spaced, or their positions on [0, 1], ends included.
+    - `degree`: of the returned Extremal between nodes, and steps of the flow there.
+    - `starts`, `seed`: how many starts without a guess; all but the first random.
+
+    **Error:** KKT residual to 1e-12, scaled; the cost exceeds the optimum by the spacing's fourth
+    power. H_u = 0 holds on average about each node (a row of the certificate) and not at every
+    time: that row fails, by as much as the control is off, and with it those of H pointwise.
+
+    **Raises:** `ValueError` for nodes that are too few, out of order, repeated, or not from 0 to 1.
+
+    **Source:** Libby's thesis, chapter 2; Hull & Helfrich (1992).
+    """
+
+    positions: Float[Array, " k"]
+    degree: int = eqx.field(static=True)
+    starts: int = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+    accuracy = 1e-9  # that its certificates ask for
+
+    def __init__(self, nodes: Any = 9, degree: int = 8, starts: int = 8, seed: int = 0):
+        if isinstance(nodes, (int, np.integer)):
+            if nodes < 2:
+                raise ValueError(f"PiecewiseLinear: nodes={nodes}; need at least 2, the ends.")
+            nodes = np.linspace(0.0, 1.0, int(nodes))
+        self.positions = jnp.asarray(nodes, jnp.result_type(float))
+        self.degree, self.starts, self.seed = degree, starts, seed
+        if self.positions.ndim != 1 or self.positions.shape[0] < 2:
+            raise ValueError(
+                f"PiecewiseLinear: nodes of shape {self.positions.shape}; give their number, or at "
+                "least two positions on [0, 1]."
+            )
+        if not is_traced(nodes):
+            _check_positions(np.asarray(nodes, float))
+        for name, least in (("degree", 2), ("starts", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(
+                    f"PiecewiseLinear: {name}={getattr(self, name)}; need at least {least}."
+                )
+
+    def check_fields(self, problem: Problem) -> None:
+        """Refuses fields that are no parameters of the control. Host only."""
+        kind = type(problem).__name__
+        for name, value in vars(problem).items():
+            if name != "final_time" and name != "initial_state" and is_free(value):
+                raise ValueError(
+                    f"{kind}.{name} is a jg.Free, which PiecewiseLinear does not choose; give it a "
+                    "number, or use jg.Pseudospectral."
+                )
+
+    def check(self, problem: Problem) -> None:
+        """Refuses what a parameter optimisation with equalities cannot do. Host only."""
+        kind = type(problem).__name__
+        free = initially_free(problem)
+        if any(free):
+            raise ValueError(
+                f"{kind}.initial_state: {problem.state_names[free.index(True)]} is free, but "
+                "PiecewiseLinear starts from a given state; give it a number, or use "
+                "jg.Pseudospectral."
+            )
+        for name in ("path_constraints", "integrands"):
+            if count(problem, name):
+                raise ValueError(
+                    f"{kind}.{name}: {count(problem, name)} of them, which PiecewiseLinear does "
+                    "not enforce; leave them out, or use jg.Pseudospectral."
+                )
+        if is_traced((problem.final_time, problem.endpoint_bounds)):
+            return
+        if not is_free(problem.final_time) and np.isinf(np.asarray(problem.final_time)):
+            raise ValueError(f"{kind}.final_time is infinite; PiecewiseLinear needs a finite one.")
+        q = endpoint_count(problem)
+        lo, hi = (np.broadcast_to(np.asarray(b), (q,)) for b in problem.endpoint_bounds)
+        if np.any(lo != hi):
+            i = int(np.argmax(lo != hi))
+            raise ValueError(
+                f"{kind}.endpoint_bounds: constraint {i} is an inequality [{lo[i]}, {hi[i]}]; "
+                "PiecewiseLinear takes equalities: set both to the active value, or leave it out."
+            )
+        size = self.positions.shape[0] * problem.m + is_free(problem.final_time)
+        if size < q:
+            raise ValueError(
+                f"{kind}: {self.positions.shape[0]} nodes make {size} parameters, fewer than the "
+                f"{q} endpoint constraints; give at least {-(-q // problem.m) + 1} nodes."
+            )
+
+    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
+        """The extremal, without host checks; `solve` wraps this. Pure."""
+        frozen, positions = jax.lax.stop_gradient((problem, self.positions))
+        if guess is None:
+            begin = _starts(problem, positions, self.starts, self.seed)
+        else:
+            begin = jax.lax.stop_gradient(self._from_guess(frozen, positions, guess))[None]
+        units = jax.vmap(functools.partial(_units, frozen, positions, self.degree))(begin)
+
+        def attempt(a: Array, units: Units) -> tuple[KKTPoint, Array, Array, Array]:
+            args = (frozen, positions)
+            found = minimise(self._values(units), a / units.a, args, _ITERATIONS)
+            return *found, self._values(units)(found[0].a, args)[0] * units.f
+
+        zs, errors, minimal, costs = jax.lax.stop_gradient(jax.vmap(attempt)(begin, units))
+        converged = (errors < 1e-6) & jnp.isfinite(costs)
+        cheapest = jnp.argmin(jnp.where(converged, costs, jnp.inf))
+        best = jnp.where(jnp.any(converged), cheapest, jnp.argmin(errors))
+        z, units = jax.tree_util.tree_map(lambda v: v[best], (zs, units))
+        values, args = self._values(units), (problem, self.positions)
+        z = polished(values, z, args)
+        error = residual(values, z, args)
+        extremal = flown(
+            problem,
+            self.positions,
+            z.a * units.a,
+            z.nu * units.f / units.c,
+            certifier,
+            degree=self.degree,
+            residual=error,
+        )
+        result = RESULTS.where(minimal[best], RESULTS.successful, RESULTS.not_minimising)
+        result = RESULTS.where(_within_bounds(extremal), result, RESULTS.bounds_violated)
+        result = RESULTS.where(error <= _TOLERANCE, result, RESULTS.parameters_not_found)
+        return eqx.tree_at(lambda e: e.result, extremal, result)
+
+    def _values(self, units: "Units") -> Any:
+        """Scaled cost and constraints, of scaled parameters."""
+
+        def values(a: Array, args: tuple[Problem, Array]) -> tuple[Array, Array]:
+            problem, positions = args
+            start = par.from_the_start(problem, a.dtype)
+            f, c, _ = par.outcome(problem, positions, a * units.a, start, self.degree)
+            return f / units.f, c / units.c
+
+        return values
+
+    def _from_guess(self, problem: Problem, positions: Array, guess: Any) -> Float[Array, " p"]:
+        """Parameters of `guess`: an Extremal, or controls at the nodes (k, m)."""
+        if isinstance(guess, Extremal):
+            t = guess.t[0] + positions * (guess.t[-1] - guess.t[0])
+            return par.pack(problem, jax.vmap(lambda t: guess.point(t).u)(t), guess.t[-1])
+        controls = jnp.asarray(guess, positions.dtype)
+        if controls.shape != (positions.shape[0], problem.m):
+            raise ValueError(
+                f"guess has shape {controls.shape}; give an Extremal, or the controls at the "
+                f"nodes, shape {(positions.shape[0], problem.m)}."
+            )
+        return par.pack(problem, controls, start_value(problem.final_time))
+
+
+class Units(NamedTuple):
+    """What parameters, cost and constraints are measured in."""
+
+    a: Float[Array, " p"]
+    f: Float[Array, ""]
+    c: Float[Array, " q"]
+
+
+def _units(problem: Problem, positions: Array, degree: int, a: Array) -> Units:
+    """The final time by its own size, controls by one; the rest by their gradients there."""
+    size = jnp.ones_like(a)
+    if is_free(problem.final_time):
+        size = size.at[-1].set(jnp.maximum(jnp.abs(a[-1]), 1e-8))
+    start = par.from_the_start(problem, a.dtype)
+    outcome = lambda a: par.outcome(problem, positions, a * size, start, degree)[:2]
+    f, c = jax.jacfwd(outcome)(a / size)
+    usable = lambda s: jnp.where(jnp.isfinite(s) & (s > 1e-8), s, 1.0)
+    return Units(size, usable(jnp.max(jnp.abs(f))), usable(jnp.max(jnp.abs(c), axis=1)))
+
+
+def _starts(problem: Problem, positions: Array, starts: int, seed: int) -> Float[Array, "start p"]:
+    """A constant control, then random straight ones over horizons within twice the guess."""
+    dtype, m = positions.dtype, problem.m
+    k_u, k_t = jax.random.split(jax.random.key(seed))
+    lo, hi = bounds_of(problem.control_bounds, m, dtype)
+    finite = jnp.isfinite(lo) & jnp.isfinite(hi)
+    half = jnp.where(finite, (hi - lo) / 2, 1.0)
+    ends = jax.random.uniform(k_u, (starts, 2, m), dtype, -1.0, 1.0).at[0].set(0.0)
+    ends = start_control(problem, dtype)[None, None] + half[None, None] * ends
+    controls = ends[:, :1] + positions[None, :, None] * (ends[:, 1:] - ends[:, :1])
+    t0 = jnp.asarray(problem.initial_time, dtype)
+    tf = jnp.asarray(start_value(problem.final_time), dtype)
+    factor = jnp.exp(jax.random.uniform(k_t, (starts,), dtype, -0.7, 0.7)).at[0].set(1.0)
+    return jax.vmap(lambda u, s: par.pack(problem, u, t0 + s * (tf - t0)))(controls, factor)
+
+
+def _within_bounds(extremal: Extremal) -> Array:
+    """Whether state and control keep within their bounds, which are not enforced."""
+    problem, slack = extremal.problem, 1e-9
+    inside = []
+    for values, bounds in (
+        (extremal.x, problem.state_bounds),
+        (extremal.u, problem.control_bounds),
+    ):
+        lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
+        inside.append(jnp.all((values >= lo[None] - slack) & (values <= hi[None] + slack)))
+    return inside[0] & inside[1]
+
+
+def _check_positions(positions: np.ndarray) -> None:
+    steps = np.diff(positions)
+    if not np.all(steps > 0):
+        i = int(np.argmax(~(steps > 0)))
+        how = "repeats" if steps[i] == 0 else "does not ascend"
+        raise ValueError(
+            f"PiecewiseLinear: nodes[{i}:{i + 2}] = {positions[i : i + 2].tolist()} {how}; give "
+            "ascending positions, each once."
+        )
+    if positions[0] != 0 or positions[-1] != 1:
+        raise ValueError(
+            f"PiecewiseLinear: nodes run from {positions[0]} to {positions[-1]}; the first must be "
+            "0 (the initial time) and the last 1 (the final one)."
+        )

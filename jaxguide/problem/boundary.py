@@ -1,0 +1,56 @@
+"""Boundary data of a Problem as arrays: initial states, their bounds, a control to start from."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.bounds import bounds_of
+from jaxguide.problem.statement import Free, Problem, is_free, start_value
+
+
+def initially_free(problem: Problem) -> tuple[bool, ...]:
+    """Which components of the initial state are free."""
+    entries = problem.initial_state
+    if isinstance(entries, (tuple, list)):
+        return tuple(is_free(e) for e in entries)
+    return (entries is None or is_free(entries),) * problem.n
+
+
+def initial_entries(problem: Problem) -> tuple[Any, ...]:
+    """One entry a state: a number or `Free`."""
+    start = problem.initial_state
+    if isinstance(start, (tuple, list)):
+        return tuple(start)
+    if start is None or is_free(start):
+        return (Free() if start is None else start,) * problem.n
+    return tuple(start[i] for i in range(problem.n))
+
+
+def initial_values(problem: Problem, dtype: Any) -> Float[Array, " n"]:
+    """Initial state, free components at their guess (or 0)."""
+    entries = problem.initial_state
+    if entries is None:
+        return jnp.zeros(problem.n, dtype)
+    if isinstance(entries, (tuple, list)):
+        return jnp.stack([jnp.asarray(start_value(e), dtype) for e in entries])
+    return jnp.broadcast_to(jnp.asarray(start_value(entries), dtype), (problem.n,))
+
+
+def initial_bounds(problem: Problem) -> tuple[Array, Array]:
+    """Of the initial state, where it is free: its own and those of every state."""
+    lo, hi = bounds_of(problem.state_bounds, problem.n, jnp.result_type(float))
+    entries = [e if is_free(e) else Free() for e in initial_entries(problem)]
+    own = [jnp.stack([jnp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
+    return jnp.maximum(lo, own[0]), jnp.minimum(hi, own[1])
+
+
+def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
+    """A control to start Newton from: the middle of finite bounds, else near 0.
+
+    The slight offset keeps clear of points where H_u = 0 by symmetry (a maximum, say).
+    """
+    lo, hi = bounds_of(problem.control_bounds, problem.m, dtype)
+    finite = jnp.isfinite(lo) & jnp.isfinite(hi)
+    middle = jnp.where(finite, (lo + hi) / 2, jnp.clip(jnp.zeros_like(lo), lo, hi))
+    return middle + 0.1 * jnp.where(finite, (hi - lo) / 2, 1.0)

@@ -1,0 +1,71 @@
+"""Static parameters of a Problem: where they are held, and the numbers a solver puts there."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.problem.statement import Problem, is_free, start_value
+from jaxguide.types import as_float
+
+Path = tuple[str | int, ...]  # attributes and indices that lead from a Problem to a leaf
+
+
+def with_parameters(problem: Problem, p: Any) -> Problem:
+    """`problem` with the numbers `p` (None: where a search starts) for its `Free` parameters."""
+    paths = problem.parameter_paths()
+    if not paths:
+        return problem  # itself, and not a copy
+    entries = parameters(problem)
+    if p is None:
+        p = [as_float(start_value(entry)) for entry in entries]
+    where = lambda q: [_follow(q, path) for path in paths]
+    return eqx.tree_at(where, problem, [p[i] for i in range(len(paths))], is_leaf=is_free)
+
+
+def parameters(problem: Problem, like: Problem | None = None) -> list[Any]:
+    """The entries of `problem` at its (or `like`'s) parameter paths."""
+    return [
+        _follow(problem, path) for path in (problem if like is None else like).parameter_paths()
+    ]
+
+
+def _follow(tree: Any, path: Path) -> Any:
+    for key in path:
+        tree = getattr(tree, key) if isinstance(key, str) else tree[key]
+    return tree
+
+
+class Chosen(eqx.Module):
+    """Static parameters that a solver chose: where a Problem holds them, and their bounds."""
+
+    paths: tuple[Path, ...] = eqx.field(static=True)
+    bounds: tuple[Array, Array]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(".".join(map(str, path)) for path in self.paths)
+
+    def values(self, problem: Problem) -> Float[Array, " k"]:
+        return jnp.stack([as_float(_follow(problem, path)) for path in self.paths])
+
+    def into(self, problem: Problem, p: Array) -> Problem:
+        """`problem` with the numbers `p` for them."""
+        where = lambda q: [_follow(q, path) for path in self.paths]
+        return eqx.tree_at(where, problem, [p[i] for i in range(len(self.paths))])
+
+
+def choices(problem: Problem) -> Chosen | None:
+    """The `Free` parameters of `problem`; None where there are none."""
+    entries = parameters(problem)
+    if not entries:
+        return None
+    side = lambda k: jnp.stack([as_float(getattr(e, k)) for e in entries])
+    return Chosen(problem.parameter_paths(), (side("lo"), side("hi")))
+
+
+def replace_parameters(problem: Problem, names: tuple[str, ...], values: Any) -> Problem:
+    """`problem` with scalar fields `names` set to the entries of `values`."""
+    return dataclasses.replace(problem, **{name: values[i] for i, name in enumerate(names)})

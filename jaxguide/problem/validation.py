@@ -1,0 +1,188 @@
+"""Badly stated problems, refused with the field, its value and the remedy. Host only."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxguide.problem.boundary import initial_entries, initial_values, initially_free, start_control
+from jaxguide.problem.parameters import with_parameters
+from jaxguide.problem.statement import Problem, is_free, start_value, with_array_leaves
+from jaxguide.types import is_traced
+
+
+@jax.jit
+def _start(problem: Problem) -> tuple[Array, ...]:
+    """Times, state, control and rate from which a search would start."""
+    dtype = jnp.result_type(float)
+    times = (problem.initial_time, problem.final_time)
+    t0, tf = (jnp.asarray(start_value(t), dtype) for t in times)
+    x0, u0 = initial_values(problem, dtype), start_control(problem, dtype)
+    return t0, tf, x0, u0, with_parameters(problem, None).dynamics(t0, x0, u0)
+
+
+def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: Any) -> tuple:
+    try:
+        out = jax.eval_shape(getattr(with_parameters(problem, None), name), *args)
+    except Exception as e:
+        raise ValueError(
+            f"{type(problem).__name__}.{name} could not be evaluated with a state of "
+            f"{problem.n} and a control of {problem.m} components: {e}"
+        ) from e
+    shape = getattr(out, "shape", None)
+    if wanted is not None and shape != wanted:
+        raise ValueError(
+            f"{type(problem).__name__}.{name} returned shape {shape}, expected {wanted}. "
+            + ("Return a scalar." if wanted == () else "Stack one entry per state.")
+        )
+    if wanted is None and (shape is None or len(shape) != 1):
+        raise ValueError(
+            f"{type(problem).__name__}.{name} returned shape {shape}; return a vector (jnp.stack)."
+        )
+    return shape  # pyright: ignore[reportReturnType]
+
+
+def _check_names(problem: Problem, name: str) -> None:
+    names = getattr(problem, name)
+    if isinstance(names, str) or not isinstance(names, tuple) or not names:
+        raise ValueError(
+            f"{type(problem).__name__}.{name} is {names!r}; give a non-empty tuple of strings, "
+            f"such as {name} = ('x',)."
+        )
+    if len(set(names)) != len(names):
+        raise ValueError(f"{type(problem).__name__}.{name} repeats a name: {names}.")
+
+
+def _check_bounds(problem: Problem, name: str, size: int) -> None:
+    bounds = getattr(problem, name)
+    if not isinstance(bounds, tuple) or len(bounds) != 2:
+        raise ValueError(f"{type(problem).__name__}.{name} is {bounds!r}; give (lower, upper).")
+    try:
+        lower, upper = (np.broadcast_to(np.asarray(b, float), (size,)) for b in bounds)
+    except ValueError as e:
+        raise ValueError(
+            f"{type(problem).__name__}.{name} = {bounds} does not broadcast to {size} components."
+        ) from e
+    bad = ~(lower <= upper)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"{type(problem).__name__}.{name}: component {i} has lower {lower[i]} above upper "
+            f"{upper[i]} (or NaN); exchange or repair them."
+        )
+
+
+def _check_start(problem: Problem, x0: Any) -> None:
+    """Refuses an initial state, or a range of one, outside the state bounds."""
+    lower, upper = (
+        np.broadcast_to(np.asarray(b, float), (problem.n,)) for b in problem.state_bounds
+    )
+    for i, (name, entry) in enumerate(
+        zip(problem.state_names, initial_entries(problem), strict=True)
+    ):
+        free = is_free(entry)
+        lo, hi = (float(entry.lo), float(entry.hi)) if free else (float(x0[i]), float(x0[i]))
+        slack = 1e-9 * (1 + abs(x0[i]))
+        if hi < lower[i] - slack or lo > upper[i] + slack:
+            given = f"between {lo} and {hi}" if free else f"{lo}"
+            raise ValueError(
+                f"{type(problem).__name__}.initial_state: {name} is {given}, outside state_bounds "
+                f"[{lower[i]}, {upper[i]}]; mend one of the two."
+            )
+
+
+def check_initial_state(problem: Problem) -> None:
+    """Refuses initial entries that are not one a state."""
+    kind, n = type(problem).__name__, problem.n
+    entries = problem.initial_state
+    if entries is not None and not is_free(entries):
+        if not isinstance(entries, (tuple, list)) and jnp.ndim(entries) != 1:
+            raise ValueError(
+                f"{kind}.initial_state is {entries!r}; give one entry for each of the {n} states "
+                f"{problem.state_names}."
+            )
+        size = len(entries) if isinstance(entries, (tuple, list)) else jnp.shape(entries)[0]
+        if size != n:
+            raise ValueError(
+                f"{kind}.initial_state has {size} entries for {n} states {problem.state_names}."
+            )
+
+
+def validate(problem: Problem) -> None:
+    """Refuses a badly stated problem, naming the field, its value and the remedy.
+
+    Shapes are always checked; values only when they are concrete (not under a trace).
+
+    **Raises:** `ValueError`.
+    """
+    if not isinstance(problem, Problem):
+        raise ValueError(
+            f"expected an instance of a jaxguide.Problem, got {problem!r}; "
+            "did you pass the class and not an instance?"
+        )
+    kind = type(problem).__name__
+    _check_names(problem, "state_names")
+    _check_names(problem, "control_names")
+    problem.check_statement()
+    n, m = problem.n, problem.m
+    dtype = jnp.result_type(float)
+    check_initial_state(problem)
+    t = jax.ShapeDtypeStruct((), dtype)
+    x, u = jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype)
+    _shape(problem, "dynamics", (n,), t, x, u)
+    _shape(problem, "running_cost", (), t, x, u)
+    _shape(problem, "endpoint_cost", (), x, x, t, t)
+    q = _shape(problem, "endpoint_constraints", None, x, x, t, t)[0]
+    p = _shape(problem, "path_constraints", None, t, x, u)[0]
+    r = _shape(problem, "integrands", None, t, x, u)[0]
+    if problem.has_closed_form:
+        _shape(problem, "optimal_control", (m,), t, x, x)
+    if is_traced(problem):
+        return
+    for name, size in (
+        ("state_bounds", n),
+        ("control_bounds", m),
+        ("endpoint_bounds", q),
+        ("path_bounds", p),
+        ("integral_bounds", r),
+    ):
+        _check_bounds(problem, name, size)
+    with jax.ensure_compile_time_eval():  # within a trace of something else, perhaps
+        t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
+    free = initially_free(problem)
+    for i, name in enumerate(problem.state_names):
+        if not np.isfinite(x0[i]):
+            raise ValueError(
+                f"{kind}.initial_state: {name} is {x0[i]}; give a finite number"
+                + (" as the guess of its jg.Free." if free[i] else " or jg.Free().")
+            )
+    _check_start(problem, x0)
+    t0, tf = float(t0), float(tf)
+    if math.isnan(t0) or math.isnan(tf) or math.isinf(t0):
+        raise ValueError(f"{kind}: initial_time is {t0} and final_time is {tf}; give numbers.")
+    if math.isinf(tf) and is_free(problem.initial_time):
+        raise ValueError(
+            f"{kind}: final_time is infinite and initial_time is {problem.initial_time}; give a "
+            "number for one of the two."
+        )
+    if not tf > t0 and not is_free(problem.final_time) and not is_free(problem.initial_time):
+        raise ValueError(
+            f"{kind}: final_time {tf} is not after initial_time {t0}; the horizon must be positive."
+        )
+    latest = problem.final_time.hi if is_free(problem.final_time) else tf
+    earliest = problem.initial_time.lo if is_free(problem.initial_time) else t0
+    if not float(latest) > float(earliest):
+        raise ValueError(
+            f"{kind}: final_time is at most {float(latest)} and initial_time at least "
+            f"{float(earliest)}; the horizon must be positive."
+        )
+    if not np.all(np.isfinite(rate)) and not any(free):
+        i = int(np.argmin(np.isfinite(rate)))
+        raise ValueError(
+            f"{kind}.dynamics: d({problem.state_names[i]})/dt is {rate[i]} at the start "
+            f"t={t0}, x={x0}, u={u0}; state bounds or a guess that keep "
+            "clear of the singularity, or mend the equation."
+        )

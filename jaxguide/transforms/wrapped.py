@@ -1,0 +1,43 @@
+"""A Problem around another: what every transformation of a Problem shares."""
+
+from typing import Any
+
+from jaxguide.problem import Problem
+
+
+class Wrapped(Problem):
+    """`inner` as it is, but for what a subclass changes."""
+
+    inner: Problem
+
+    def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
+        return tuple(("inner", *path) for path in self.inner.parameter_paths())
+
+    def dynamics(self, t: Any, x: Any, u: Any) -> Any:
+        return self.inner.dynamics(t, x, u)
+
+    def running_cost(self, t: Any, x: Any, u: Any) -> Any:
+        return self.inner.running_cost(t, x, u)
+
+    def path_constraints(self, t: Any, x: Any, u: Any) -> Any:
+        return self.inner.path_constraints(t, x, u)
+
+    def integrands(self, t: Any, x: Any, u: Any) -> Any:
+        return self.inner.integrands(t, x, u)
+
+    def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        return self.inner.endpoint_cost(x0, xf, t0, tf)
+
+    def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
+        return self.inner.endpoint_constraints(x0, xf, t0, tf)
+
+
+FIELDS = (
+    "state_names", "control_names", "initial_time", "final_time", "initial_state", "state_bounds",
+    "control_bounds", "endpoint_bounds", "path_bounds", "integral_bounds",
+)  # fmt: skip
+
+
+def own_fields(problem: Problem, **changed: Any) -> dict[str, Any]:
+    """The fields of a Problem around `problem`: its own, but for those `changed`."""
+    return {name: getattr(problem, name) for name in FIELDS} | changed
