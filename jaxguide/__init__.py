@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from jaxguide import problems as problems
     from jaxguide import tuning as tuning
     from jaxguide.certificate import Certificate as Certificate
+    from jaxguide.certificate import Certified as Certified
     from jaxguide.certificate import certify as certify
     from jaxguide.flight.integrators import Adaptive as Adaptive
     from jaxguide.flight.integrators import RungeKutta4 as RungeKutta4
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from jaxguide.neighboring.suboptimal import suboptimal_gains as suboptimal_gains
     from jaxguide.nominal.direct.pseudospectral import Pseudospectral as Pseudospectral
     from jaxguide.nominal.indirect.shooting import Shooting as Shooting
+    from jaxguide.nominal.method import Capabilities as Capabilities
+    from jaxguide.nominal.method import Method as Method
     from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear as PiecewiseLinear
     from jaxguide.problem import Free as Free
     from jaxguide.problem import Problem as Problem
@@ -72,7 +75,9 @@ __version__ = "0.1.0"
 _HOME = {
     "Adaptive": "flight.integrators",
     "Bellman": "solving.bellman",
+    "Capabilities": "nominal.method",
     "Certificate": "certificate",
+    "Certified": "certificate",
     "Command": "laws.law",
     "Extremal": "trajectory",
     "Flight": "flight.simulate",
@@ -85,6 +90,7 @@ _HOME = {
     "LinearGains": "laws.gain_interpolation",
     "LinearTPBVP": "neighboring.linearization",
     "LogNormal": "montecarlo.dispersions",
+    "Method": "nominal.method",
     "Mission": "flight.mission",
     "MultivariateNormal": "montecarlo.dispersions",
     "NeighboringOptimal": "laws.neighboring",

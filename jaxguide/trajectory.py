@@ -115,7 +115,6 @@ class Extremal(Trajectory):
     result: RESULTS
     residual: Float[Array, ""]
     problem: Problem
-    certifier: Callable = eqx.field(static=True)
     # Whether a bound is neither clearly active nor clearly free: derivatives with respect to
     # parameters then lie between the one-sided ones. None: there are no bounds.
     degenerate: Bool[Array, ""] | None = None
@@ -144,12 +143,6 @@ class Extremal(Trajectory):
     def _own_ends(self, values: Array, before: Array | None) -> Array:
         parts = self.by_segment(values)
         return parts if before is None else parts.at[:, -1].set(before)
-
-    @property
-    def certificate(self) -> Any:
-        """How good this extremal is: every check, computed when asked for. Of a batch, as from
-        `solve_batch`, with a leading axis of lanes."""
-        return jax.vmap(self.certifier)(self) if self.t.ndim == 2 else self.certifier(self)
 
     def __call__(self, t: Any) -> Point:
         """State, control and costate at `t`, scalar or (T,); held beyond the horizon.

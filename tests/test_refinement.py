@@ -10,7 +10,7 @@ import pytest
 import jaxguide as jg
 from jaxguide import problems
 from jaxguide.nominal.refinement.arcs import Arcs, _cut, without_collapsed
-from jaxguide.nominal.refinement.refine import moved
+from jaxguide.nominal.refinement.meshes import moved
 
 # What a fixed mesh of 12 segments of 6 Radau nodes leaves of the objective, from a straight line as
 # guess, of one problem of each kind: each is a program of its own, and compiles for seconds.

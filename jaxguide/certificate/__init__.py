@@ -1,54 +1,7 @@
-"""How good an extremal is: its Certificate, computed independently of what found it."""
+"""How good an extremal is, each necessary condition as a number with its bound."""
 
-import functools
-from collections.abc import Callable
-
-import equinox as eqx
-
-from jaxguide.certificate import checks, costly
-from jaxguide.certificate.along import Along
-from jaxguide.certificate.table import Certificate, Rows
-from jaxguide.trajectory import Extremal
-from jaxguide.transforms.endless import closed
-
-__all__ = ["Certificate", "certifier", "certify"]
-
-
-def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -> Certificate:
-    """Checks an extremal against the conditions it should meet, independently of its solver.
-
-    **Arguments:** `tolerance`: of the relative errors; `costly`: also fly the interpolated control
-    with an adaptive integrator (Diffrax, 1e-11) and compare with the extremal's own states; and
-    look for conjugate points, past which an extremal minimises nothing, by a backward sweep of its
-    second variation. Errors are relative to the size of what is compared, so the tolerance holds
-    in any units.
-
-    **Source:** 2002 paper eqs (2)-(9); review, section 4.
-    """
-    return _certified(extremal, costly, tolerance)
-
-
-@functools.cache
-def certifier(tolerance: float) -> Callable[[Extremal], Certificate]:
-    """`certify` to a tolerance: one function for each, so that equal ones compile once."""
-    return functools.partial(certify, tolerance=tolerance)
-
-
-@eqx.filter_jit
-def _certified(extremal: Extremal, fly: bool, tight: float) -> Certificate:
-    rows, along = Rows(), Along(extremal if extremal.stretch is None else closed(extremal))
-    if fly:
-        costly.flown(rows, along)
-    for check in (
-        checks.canonical,
-        checks.boundary,
-        checks.energy,
-        checks.jumps,
-        checks.stationarity,
-        checks.bounds,
-        checks.integrals,
-        checks.parameters,
-        checks.tails,
-    ):
-        check(rows, along, tight)
-    return rows.done()
+from jaxguide.certificate.certified import Certified as Certified
+from jaxguide.certificate.certified import certified as certified
+from jaxguide.certificate.certified import plain as plain
+from jaxguide.certificate.certify import certify as certify
+from jaxguide.certificate.table import Certificate as Certificate

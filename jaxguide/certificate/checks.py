@@ -12,6 +12,7 @@ from jaxtyping import Array
 from jaxguide.bounds import bound_size, overstep, slackness
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Rows
+from jaxguide.conditions.bounded import bounded
 from jaxguide.conditions.hamiltonian import (
     constrained_hamiltonian,
     endpoint_lagrangian,
@@ -135,22 +136,16 @@ def stationarity(rows: Rows, a: Along, tight: float) -> None:
 
 def bounds(rows: Rows, a: Along, tight: float) -> None:
     """Path constraints, states and controls within bounds, and the signs of their covectors."""
-    extremal, size, problem = a.extremal, a.size, a.extremal.problem
-    t, m = extremal.t, extremal.multipliers
-    h = a.at_nodes(lambda p, t, x, u, c, k: p.path_constraints(t, x, u))
-    paths = tuple(f"path {i}" for i in range(h.shape[1]))
+    extremal, problem, t = a.extremal, a.extremal.problem, a.extremal.t
+    m = extremal.multipliers
+    covectors = (m.path, m.state, m.control)
+    found = bounded(problem, t, extremal.x, extremal.u, covectors, a.size)
+    paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
-    kinds = (
-        ("path constraints", paths, h, problem.path_bounds, m.path, size.path),
-        ("state bounds", states, extremal.x, problem.state_bounds, m.state, size.x),
-        ("control bounds", controls, extremal.u, problem.control_bounds, m.control, size.u),
-    )
-    for name, labels, values, within, _, of in kinds:
-        rows.add(name, labels, overstep(values, within) / of[None], t, tight)
-    slack = jax.vmap(slackness, in_axes=(0, 0, None, None))
-    signs = [slack(by, values, within, of) * of[None] for _, _, values, within, by, of in kinds]
-    signs = jnp.concatenate(signs, axis=1) / size.hamiltonian
-    rows.add("complementarity", paths + states + controls, signs, t, tight)
+    rows.add("path constraints", paths, found.path, t, tight)
+    rows.add("state bounds", states, found.state, t, tight)
+    rows.add("control bounds", controls, found.control, t, tight)
+    rows.add("complementarity", paths + states + controls, found.complementarity, t, tight)
 
 
 def integrals(rows: Rows, a: Along, tight: float) -> None:

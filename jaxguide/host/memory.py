@@ -1,6 +1,8 @@
-"""Memory that compilation leaves behind, given back. Host only."""
+"""The memory of this machine: how much there is; what compilation left, given back. Host only."""
 
 import ctypes
+import math
+import os
 
 
 def trim() -> None:
@@ -10,3 +12,11 @@ def trim() -> None:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError, TypeError):  # another C library
         pass
+
+
+def physical_memory() -> float:
+    """Bytes of this machine; infinite where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (ValueError, OSError, AttributeError):
+        return math.inf

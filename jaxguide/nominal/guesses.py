@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxguide.nominal.method import Method
 from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 
@@ -16,22 +17,24 @@ def is_key(guess: Any) -> bool:
     return isinstance(guess, jax.Array) and jnp.issubdtype(guess.dtype, jax.dtypes.prng_key)
 
 
-def check_guess(problem: Problem, guess: Any, direct: bool, without_end: bool) -> None:
-    """Refuses what a method, `direct` or shooting, cannot start from.
+def check_guess(problem: Problem, guess: Any, method: Method, without_end: bool) -> None:
+    """Refuses what `method` cannot start from. `without_end`: whether the horizon of `problem` is,
+    or may be, infinite.
 
     **Raises:** `ValueError`.
     """
-    kind = type(problem).__name__
+    kind, name, can = type(problem).__name__, type(method).__name__, method.capabilities
     if guess is None:
         return
     if isinstance(guess, Extremal):
         _check_extremal(problem, guess, without_end)
         return
     if is_key(guess):
-        if not direct:
+        if not can.random_start:
             raise ValueError(
-                "guess is a random key, which is for jg.Pseudospectral; shooting has random starts "
-                "of its own: jg.Shooting(starts=..., seed=...)."
+                f"guess is a random key, which is for jg.Pseudospectral and not for {name}; "
+                "jg.Shooting and jg.PiecewiseLinear have random starts of their own: starts=..., "
+                "seed=...."
             )
         if guess.shape:
             raise ValueError(f"guess is {guess.shape[0]} random keys; give one, such as key[0].")
@@ -42,14 +45,13 @@ def check_guess(problem: Problem, guess: Any, direct: bool, without_end: bool) -
             "guess is an array of uint32, as jax.random.PRNGKey makes; for a random start give "
             "jax.random.key(seed)."
         )
-    if direct or not array:
+    if not (array and can.array_guess):
         raise ValueError(
-            f"guess is a {type(guess).__name__}; give {kind} an Extremal, "
-            + (
-                "a jax.random.key, or None. Initial costates are for jg.Shooting."
-                if direct
-                else f"the {problem.n} initial costates, or None."
-            )
+            f"guess is a {type(guess).__name__}; give {kind} an Extremal"
+            + (", a jax.random.key" if can.random_start else "")
+            + (f", {can.array_guess}" if can.array_guess else "")
+            + ", or None."
+            + ("" if can.array_guess else " Initial costates are for jg.Shooting.")
         )
 
 

@@ -7,15 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxguide.certificate import Certified, certified, plain
 from jaxguide.host.compilation import compiled
 from jaxguide.host.cores import over_cores
 from jaxguide.host.progress import Progress, metered
-from jaxguide.nominal.direct.pseudospectral import Pseudospectral
-from jaxguide.nominal.guesses import check_guess
+from jaxguide.nominal.method import Method
 from jaxguide.problem import Problem, with_array_leaves
-from jaxguide.solving.solve import chosen, on_fixed_mesh, solve
+from jaxguide.solving.solve import default_method, on_fixed_mesh, solve, stated
 from jaxguide.trajectory import Extremal
-from jaxguide.transforms.endless import is_endless
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
 _tree = jax.tree_util.tree_map
@@ -25,12 +24,12 @@ CHUNK = 16  # lanes that one thread solves in one call of the program: dispatch 
 
 def solve_batch(
     problems: Problem | Sequence[Problem],
-    method: Any = None,
+    method: Method | None = None,
     guess: Extremal | None = None,
     throw: bool = False,
     progress: Progress | None = None,
     workers: int | None = None,
-) -> Extremal:
+) -> Certified:
     """Solves each of `problems` on the method's fixed mesh; one batched Extremal.
 
     Chunks of lanes go to whichever of the host threads is idle, and a lane is what its own `solve`
@@ -61,14 +60,10 @@ def solve_batch(
             f"solve_batch: guess has {guess.t.shape[0]} lanes for {count} problems; give one a "
             "problem, or a single Extremal for all."
         )
-    method = chosen(batch) if method is None else method
+    method = default_method(batch) if method is None else method
     first = lane(batch, 0)
-    check_guess(
-        first,
-        lane(guess, 0) if own else guess,
-        isinstance(method, Pseudospectral),
-        is_endless(first),
-    )
+    stated(first, method, lane(guess, 0) if own else guess)
+    guess = plain(guess) if isinstance(guess, Extremal) else guess
     if is_traced((batch, guess)):
         one = lambda p, g: solve(p, method, g, throw=False)
         return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)
@@ -80,7 +75,7 @@ def solve_batch(
         at = np.arange(k * CHUNK, min((k + 1) * CHUNK, count))
         padded = np.pad(at, (0, CHUNK - len(at)), mode="edge")
         own_or_shared = lane(guess, padded) if own else guess
-        program = compiled(_lanes_of, getattr(method, "quick", False))
+        program = compiled(_lanes_of, method.quick)
         done = program(one, lane(batch, padded), own_or_shared, jnp.asarray(len(at)), own)
         return _tree(lambda a: a[: len(at)], jax.device_get(done))
 
@@ -96,7 +91,7 @@ def solve_batch(
             f"{', ...' if failed.size > 20 else ''}. Solve one with jg.solve to see why, or pass "
             "throw=False and look at .result."
         )
-    return out
+    return certified(out, method.accuracy)
 
 
 def _lanes_of(one: Any, problems: Problem, guess: Any, count: Any, own: bool) -> Extremal:

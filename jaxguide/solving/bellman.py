@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.problem import Problem
-from jaxguide.solving.solve import chosen, solve
+from jaxguide.solving.solve import default_method, solve
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, succeeded
 
@@ -45,7 +45,7 @@ def bellman(problem: Problem, method: Any = None, segments: int = 4, guess: Any 
     """
     if segments < 1:
         raise ValueError(f"bellman: segments is {segments}; give at least 1.")
-    method = chosen(problem) if method is None else method
+    method = default_method(problem) if method is None else method
     extremals: list[Extremal] = []
     times, states = [], []
     cost = jnp.zeros(())

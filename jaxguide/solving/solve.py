@@ -7,37 +7,38 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxguide.certificate import certifier
+from jaxguide.certificate import Certified, certified, plain
 from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.guesses import check_guess, is_key
 from jaxguide.nominal.indirect.shooting import Shooting
+from jaxguide.nominal.method import Method, refuse_beyond
 from jaxguide.nominal.refinement.refine import refined
 from jaxguide.problem import Problem, validate, with_array_leaves
 from jaxguide.solving.diagnosis import why
-from jaxguide.solving.ladder import best_start, run_once
+from jaxguide.solving.ladder import from_starts
 from jaxguide.trajectory import Extremal
-from jaxguide.transforms.endless import closed, endless, is_endless, opened
+from jaxguide.transforms.endless import is_endless, made_finite, opened
 from jaxguide.types import SolveError, is_traced, require_x64, succeeded
 
 
 def solve(
     problem: Problem,
-    method: Any = None,
+    method: Method | None = None,
     guess: Any = None,
     throw: bool = True,
     watch: Callable[[Any], None] | None = None,
-) -> Extremal:
+) -> Certified:
     """Solves `problem` for an extremal that carries its own certificate.
 
     **Arguments:**
 
     - `problem`: the Problem; its parameters may be traced, so this may be `vmap`ped and
       differentiated (implicitly, forward and reverse).
-    - `method`: `jg.Shooting`, `jg.Pseudospectral` or `jg.PiecewiseLinear`. Default: shooting, the
-      more accurate, unless the Problem has bounds, path constraints or what else shooting cannot
-      do; where shooting finds nothing, a direct solution, polished by shooting from there if that
-      succeeds. Under a
-      trace bounds cannot be seen: name the method, or look for `bounds_violated`.
+    - `method`: `jg.Shooting`, `jg.Pseudospectral`, `jg.PiecewiseLinear` or a `jg.Method` of your
+      own. Default: shooting, the more accurate, unless the Problem has bounds, path constraints or
+      anything else that shooting cannot do; if shooting finds nothing, a direct solution, polished
+      by shooting from there if that succeeds. Under a trace bounds cannot be seen: name the
+      method, or look for `bounds_violated`.
     - `guess`: None, an Extremal of a similar problem, initial costates (n,) for shooting, or a
       `jax.random.key` for a random start of a direct solve.
     - `watch`: called after each solve of a direct method's refinement with what it is and how
@@ -45,43 +46,26 @@ def solve(
     - `throw`: raise if it fails. Under a trace nothing is raised; look at `.result`.
 
     **Raises:** `ValueError` for a badly stated problem, `RuntimeError` without float64,
-    `SolveError` (with what missed, by how much and what to try) when no extremal was found.
+    `SolveError` (with the worst constraint, by how much it is missed and what to try) when no
+    extremal was found.
     """
     require_x64("jg.solve")
     if method is None and not is_traced((problem, guess)):
         return _by_default(problem, guess, throw, watch)
-    method = chosen(problem) if method is None else method
-    if isinstance(method, type) or not hasattr(method, "check_fields"):
-        raise ValueError(
-            f"jg.solve: method is {method!r}; give an instance, such as jg.Pseudospectral()."
-        )
-    if isinstance(problem, Problem):
-        method.check_fields(problem)
-    validate(problem)
-    method.check(problem)
-    direct = isinstance(method, Pseudospectral)
-    without_end = direct and is_endless(problem)
-    check_guess(problem, guess, direct, without_end or is_traced(problem.final_time))
-    problem = with_array_leaves(problem)
-    if is_traced((problem, guess, method)):
-        return _traced(method, without_end, problem, guess)
-    if without_end:
-        problem = endless(problem, method.time_scale)
-        guess = closed(guess) if _is_opened(guess) else guess
-    extremal = best_start(method, problem, guess) if direct else run_once(method, problem, guess)
-    if direct and method.refinements:
-        extremal = refined(run_once, method, problem, extremal, watch or (lambda _: None))
-    if without_end:
-        extremal = opened(extremal)
-    if throw:
+    method = default_method(problem) if method is None else method
+    problem, guess = stated(problem, method, guess)
+    pure = is_traced((problem, guess, method))
+    solved = on_fixed_mesh(problem, method) if pure else _on_host(method, watch)
+    extremal = certified(solved(problem, guess), method.accuracy)
+    if throw and not pure:
         raise_if_failed(extremal)
     return extremal
 
 
-def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Extremal:
-    """With the method `chosen`; where shooting finds nothing by itself, from a direct solution."""
-    method = Pseudospectral() if is_key(guess) else chosen(problem)
-    if not isinstance(method, Shooting):
+def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Certified:
+    """With the default method; where shooting finds nothing by itself, from a direct solution."""
+    method = Pseudospectral() if is_key(guess) else default_method(problem)
+    if method.capabilities.direct:
         return solve(problem, method, guess, throw, watch)
     extremal = solve(problem, method, guess, throw=False)
     if succeeded(extremal.result):
@@ -96,32 +80,9 @@ def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Extrem
     return extremal
 
 
-def chosen(problem: Problem) -> Any:
+def default_method(problem: Problem) -> Method:
     """The method where none is named."""
     return Shooting() if _is_unconstrained(problem) else Pseudospectral()
-
-
-def on_fixed_mesh(problem: Problem, method: Any) -> Callable[[Problem, Any], Extremal]:
-    """What `solve` does under a trace, pure, for problems of this one's structure, which is checked
-    here."""
-    method.check_fields(problem)
-    validate(problem)
-    method.check(problem)
-    without_end = isinstance(method, Pseudospectral) and is_endless(problem)
-    return jax.tree_util.Partial(_traced, method, without_end)
-
-
-@eqx.filter_jit  # else a bare jax.grad runs it operation by operation
-def _traced(method: Any, without_end: bool, problem: Problem, guess: Any) -> Extremal:
-    if without_end:
-        problem = endless(problem, method.time_scale)
-        guess = closed(guess) if _is_opened(guess) else guess
-    extremal = method(problem, guess, certifier(method.accuracy))
-    return opened(extremal) if without_end else extremal
-
-
-def _is_opened(guess: Any) -> bool:
-    return isinstance(guess, Extremal) and guess.stretch is not None
 
 
 def _is_unconstrained(problem: Problem) -> bool:
@@ -141,6 +102,51 @@ def _is_unconstrained(problem: Problem) -> bool:
         and not is_endless(problem)
         and bool(np.all(np.asarray(problem.endpoint_bounds[0]) == problem.endpoint_bounds[1]))
     )
+
+
+def stated(problem: Problem, method: Method, guess: Any) -> tuple[Problem, Any]:
+    """Problem and guess as a method takes them, once nothing is wrong with either.
+
+    **Raises:** `ValueError`.
+    """
+    if not isinstance(method, Method):
+        raise ValueError(
+            f"jg.solve: method is {method!r}; give an instance, such as jg.Pseudospectral()."
+        )
+    validate(problem)
+    refuse_beyond(method, problem)
+    method.check(problem)
+    maybe_endless = is_endless(problem) or is_traced(problem.final_time)
+    check_guess(problem, guess, method, method.capabilities.endless and maybe_endless)
+    return with_array_leaves(problem), plain(guess) if isinstance(guess, Extremal) else guess
+
+
+def _on_host(method: Method, watch: Any) -> Callable[[Problem, Any], Extremal]:
+    """Starts and refinement, each solve a compiled program."""
+
+    def solved(problem: Problem, guess: Any) -> Extremal:
+        without_end = is_endless(problem)
+        if without_end:
+            problem, guess = made_finite(problem, guess, method)
+        extremal = from_starts(method, problem, guess)
+        if method.capabilities.mesh:
+            extremal = refined(method, problem, extremal, watch)
+        return opened(extremal) if without_end else extremal
+
+    return solved
+
+
+def on_fixed_mesh(problem: Problem, method: Method) -> Callable[[Problem, Any], Extremal]:
+    """What `solve` does under a trace, pure, for checked problems of this one's structure."""
+    return jax.tree_util.Partial(_traced, method, is_endless(problem))
+
+
+@eqx.filter_jit  # else a bare jax.grad runs it operation by operation
+def _traced(method: Method, without_end: bool, problem: Problem, guess: Any) -> Extremal:
+    if without_end:
+        problem, guess = made_finite(problem, guess, method)
+    extremal = method(problem, guess)
+    return opened(extremal) if without_end else extremal
 
 
 def raise_if_failed(extremal: Extremal) -> None:

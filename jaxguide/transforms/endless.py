@@ -57,6 +57,18 @@ class Endless(Wrapped):
         return xf if self.at_rest else own
 
 
+def is_endless(problem: Problem) -> bool:
+    """Whether its final time is infinite, as far as can be seen."""
+    tf = problem.final_time
+    return not is_free(tf) and not is_traced(tf) and bool(np.any(np.isinf(np.asarray(tf))))
+
+
+def made_finite(problem: Problem, guess: Any, method: Any) -> tuple[Problem, Any]:
+    """An endless problem on [-1, 1] by `method.time_scale`, and a guess as an extremal of it."""
+    opened_before = isinstance(guess, Extremal) and guess.stretch is not None
+    return endless(problem, method.time_scale), closed(guess) if opened_before else guess
+
+
 def endless(problem: Problem, scale: Any) -> Problem:
     """`problem`, whose final time is infinite, on [-1, 1]."""
     dtype = jnp.result_type(float)
@@ -127,9 +139,3 @@ def closed(extremal: Extremal) -> Extremal:
 
 def _rerooted(chosen: Chosen | None, along: Callable[[Path], Path]) -> Chosen | None:
     return chosen and Chosen(tuple(map(along, chosen.paths)), chosen.bounds)
-
-
-def is_endless(problem: Problem) -> bool:
-    """Whether its final time is infinite, as far as can be seen."""
-    tf = problem.final_time
-    return not is_free(tf) and not is_traced(tf) and bool(np.any(np.isinf(np.asarray(tf))))

@@ -3,8 +3,6 @@
 **Source:** Ross & Karpenko, review (2012), eqs (23)-(25), Proposition 1.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -27,7 +25,6 @@ def to_extremal(
     program: Transcription,
     box: Bounds,
     solution: interior_point.Solution,
-    certifier: Any,
 ) -> Extremal:
     """User units; costates by the covector mapping theorem (eqs 23-25)."""
     size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
@@ -110,7 +107,6 @@ def to_extremal(
         residual=residual,
         degenerate=_undecided(box, solution),
         problem=problem,
-        certifier=certifier,
         chosen=chosen,
     )
 

@@ -4,9 +4,7 @@
 """
 
 import dataclasses
-import math
-import os
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -14,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxguide.host.compilation import compiled, without_collection
 from jaxguide.host.lapack import single_threaded_lapack
+from jaxguide.host.memory import physical_memory
 from jaxguide.nominal.defects import segment_errors
 from jaxguide.nominal.direct import interior_point
 from jaxguide.nominal.direct.collocation import FAMILIES, collocation
@@ -27,6 +27,7 @@ from jaxguide.nominal.direct.units import designer_units, unit_scale
 from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.direct.warm import blank_duals, duals, fits
 from jaxguide.nominal.guesses import is_key
+from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import Endless
@@ -43,7 +44,7 @@ def _hashable(numbers: Any) -> Any:
     return tuple(numbers.tolist()) if numbers.ndim else float(numbers)
 
 
-class Pseudospectral(eqx.Module):
+class Pseudospectral(Method):
     """Direct collocation on one or many segments, solved by the interior-point method.
 
     **Arguments:**
@@ -99,7 +100,17 @@ class Pseudospectral(eqx.Module):
     mesh_tolerance: float = eqx.field(static=True, default=1e-7)
     log: bool = eqx.field(static=True, default=False)
     quick: bool = eqx.field(static=True, default=True)
-    accuracy = 1e-6  # that its certificates ask for
+    accuracy: ClassVar[float] = 1e-6
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        direct=True,
+        bounds=True,
+        inequalities=True,
+        integrals=True,
+        parameters=True,
+        endless=True,
+        mesh=True,
+        random_start=True,
+    )
 
     def __check_init__(self):
         if self.grid not in FAMILIES:
@@ -147,9 +158,6 @@ class Pseudospectral(eqx.Module):
             raise ValueError(f"Pseudospectral: time_scale is {self.time_scale}; give one above 0.")
         collocation(self.grid, self.nodes)
 
-    def check_fields(self, problem: Problem) -> None:
-        """Nothing that a Problem may hold is beyond it. Host only."""
-
     def check(self, problem: Problem) -> None:
         """Refuses a mesh that memory will not hold, or that integrals do not go with. Host only.
 
@@ -161,7 +169,7 @@ class Pseudospectral(eqx.Module):
                 f"segment more than an integral has unknowns, and {type(problem).__name__} has "
                 "integral constraints; use 'lgr-right', 'lgr-left' or 'lg'."
             )
-        need, have = self.memory(problem), _physical_memory()
+        need, have = self.memory(problem), physical_memory()
         if need > have:
             segments = self.segments if self.fractions is None else len(self.fractions) - 1
             raise ValueError(
@@ -180,16 +188,25 @@ class Pseudospectral(eqx.Module):
         entries = 2 * basis**2 + 4 * basis * directions + directions**2
         return 8 * segments * (3 * entries + C * (n + m + 2) ** 2 * 4)
 
-    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
-        """The extremal on the fixed mesh, without host checks; `solve` wraps this. Where the method
-        would refine, but no host can, one short of `mesh_tolerance` is `RESULTS.underresolved`."""
-        extremal = finished(problem, *self.prepared(problem, guess), certifier)
+    def __call__(self, problem: Problem, guess: Any) -> Extremal:
+        """The extremal on the fixed mesh. Where `solve` would refine it on the host, one short of
+        `mesh_tolerance` is `RESULTS.underresolved`."""
+        extremal = finished(problem, *self.prepared(problem, guess))
         if not self.refinements:
             return extremal
         resolved = jnp.max(segment_errors(extremal)) <= self.mesh_tolerance
         good = extremal.result == RESULTS.successful
         result = RESULTS.where(good & ~resolved, RESULTS.underresolved, extremal.result)
         return dataclasses.replace(extremal, result=result)
+
+    def run(self, problem: Problem, guess: Any) -> Extremal:
+        """In two programs, so that the optimiser's serves every guess and every mesh of its size.
+        What the host may refine is not judged here."""
+        if self.log:
+            units = self.units(problem, guess).items()
+            print("designer units: " + ", ".join(f"{k} {v:.4g}" for k, v in units))
+        with without_collection():
+            return compiled(finished, self.quick)(problem, *_prepared(self, problem, guess))
 
     def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
         """Designer units: what the solver takes for one of each state, control, time, constraint
@@ -285,26 +302,23 @@ def finished(
     program: Transcription,
     start: interior_point.Start,
     options: interior_point.Options,
-    certifier: Any,
 ) -> Extremal:
     """What the optimiser makes of `Pseudospectral.prepared`: one program for every guess, break
     and scale."""
     whole = rewrapped(program.problem, problem)
     solution = _solved((whole, program.edges), program, start, options)
     program = _stated(program, (whole, program.edges))
-    return to_extremal(problem, program, bounds(program), solution, certifier)
+    return to_extremal(problem, program, bounds(program), solution)
+
+
+@eqx.filter_jit
+def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
+    return method.prepared(problem, guess)
 
 
 @eqx.filter_jit
 def _scale(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
     return method.prepared(problem, guess)[0].scale
-
-
-def _physical_memory() -> float:
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError, AttributeError):  # where the system does not say
-        return math.inf
 
 
 @jax.custom_batching.sequential_vmap

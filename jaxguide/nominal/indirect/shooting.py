@@ -1,13 +1,12 @@
 """Indirect multiple shooting: the necessary conditions solved to rounding, differentiably."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax.flatten_util
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
@@ -21,16 +20,17 @@ from jaxguide.linalg import SmallLU, cholesky_positive
 from jaxguide.nominal.indirect.boundary import Unknowns, boundary_residual, horizon
 from jaxguide.nominal.indirect.coarse import coarse_ends, damped_newton, objective
 from jaxguide.nominal.indirect.starts import random_start
+from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.nominal.steps import dopri8
 from jaxguide.problem import Problem, endpoint_count, is_free, start_value
 from jaxguide.spectral import nodes_lgl
 from jaxguide.trajectory import Extremal, Multipliers
-from jaxguide.types import RESULTS, is_traced
+from jaxguide.types import RESULTS
 
 _COARSE_ITERATIONS, _COARSE_TOLERANCE = 60, 1e-7
 
 
-class Shooting(eqx.Module):
+class Shooting(Method):
     """Single (`arcs=1`) or multiple indirect shooting.
 
     Three stages, each in fixed shapes: damped Newton with coarse steps, from the guess or from
@@ -57,7 +57,10 @@ class Shooting(eqx.Module):
     coarse_steps: int = eqx.field(static=True, default=96)
     seed: int = eqx.field(static=True, default=0)
     max_steps: int = eqx.field(static=True, default=1024)
-    accuracy = 1e-9  # that its certificates ask for
+    accuracy: ClassVar[float] = 1e-9
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        direct=False, array_guess="the initial costates"
+    )
 
     def __check_init__(self):
         if self.arcs < 1 or self.segments < 1 or self.segments % self.arcs:
@@ -72,47 +75,7 @@ class Shooting(eqx.Module):
         if not 0 < self.tolerance < 1:
             raise ValueError(f"Shooting: tolerance={self.tolerance}; give one in (0, 1).")
 
-    def check_fields(self, problem: Problem) -> None:
-        """Refuses fields that shooting cannot choose, before anything is evaluated. Host only."""
-        kind = type(problem).__name__
-        fixed = ("initial_time", "final_time", "initial_state")
-        for name, value in vars(problem).items():
-            if name not in fixed and is_free(value):
-                raise ValueError(
-                    f"{kind}.{name} is a jg.Free static parameter, which shooting does not "
-                    "optimise; give it a number, or add it as a state with zero rate and a free "
-                    "initial value."
-                )
-
-    def check(self, problem: Problem) -> None:
-        """Refuses what indirect shooting cannot do. Host only."""
-        kind = type(problem).__name__
-        if is_traced((problem.final_time, problem.endpoint_bounds)):
-            return
-        if not is_free(problem.final_time) and np.any(np.isinf(np.asarray(problem.final_time))):
-            raise ValueError(
-                f"{kind}.final_time is infinite; shooting needs a finite one (try some ten time "
-                "constants)."
-            )
-        x = jax.ShapeDtypeStruct((problem.n,), jnp.result_type(float))
-        u = jax.ShapeDtypeStruct((problem.m,), jnp.result_type(float))
-        t = jax.ShapeDtypeStruct((), jnp.result_type(float))
-        if jax.eval_shape(problem.integrands, t, x, u).shape[0]:
-            raise ValueError(
-                f"{kind}.integrands: integral constraints are not for shooting; write each as a "
-                "state with an endpoint constraint."
-            )
-        q = endpoint_count(problem)
-        lo, hi = (np.broadcast_to(np.asarray(b), (q,)) for b in problem.endpoint_bounds)
-        if np.any(lo != hi):
-            i = int(np.argmax(lo != hi))
-            raise ValueError(
-                f"{kind}.endpoint_bounds: constraint {i} is an inequality [{lo[i]}, {hi[i]}]; "
-                "shooting takes equalities: set both bounds to the active value, or leave it out."
-            )
-
-    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
-        """The extremal, without host checks; `solve` wraps this. Pure."""
+    def __call__(self, problem: Problem, guess: Any) -> Extremal:
         dtype = jnp.result_type(float)
         frozen = jax.lax.stop_gradient(problem)
         if guess is None:
@@ -120,7 +83,7 @@ class Shooting(eqx.Module):
         else:
             z = jax.lax.stop_gradient(self._from_guess(frozen, guess, dtype))
         z, fractions = jax.lax.stop_gradient(self._lay_mesh(frozen, z))
-        return self._on_mesh(problem, z, fractions, certifier)
+        return self._on_mesh(problem, z, fractions)
 
     @property
     def _arc_steps(self) -> int:
@@ -242,7 +205,7 @@ class Shooting(eqx.Module):
             jnp.where(ok, breaks, uniform),
         )
 
-    def _on_mesh(self, problem: Problem, z: Unknowns, breaks: Array, certifier: Any) -> Extremal:
+    def _on_mesh(self, problem: Problem, z: Unknowns, breaks: Array) -> Extremal:
         p = self.degree + 1
         tau = jnp.asarray(nodes_lgl(p)[0], z.starts.dtype)
         inner = breaks[:-1, None] + jnp.diff(breaks)[:, None] * (tau[None, :-1] + 1) / 2
@@ -287,7 +250,6 @@ class Shooting(eqx.Module):
             result=_judge(problem, t, x, u, costate, worst, cost),
             residual=worst,
             problem=problem,
-            certifier=certifier,
         )
         # In units where everything is small, `worst` alone would pass.
         e = problem.endpoint_constraints(x[0], x[-1], t0, tf)

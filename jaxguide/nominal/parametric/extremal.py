@@ -21,7 +21,6 @@ def flown(
     positions: Any,
     a: Any,
     nu: Any,
-    certifier: Any,
     degree: int = 8,
     residual: Any = 0.0,
 ) -> Extremal:
@@ -58,7 +57,6 @@ def flown(
         result=RESULTS.where(jnp.array(True), RESULTS.successful, RESULTS.successful),
         residual=jnp.asarray(residual, t.dtype),
         problem=problem,
-        certifier=certifier,
         parametric=True,
     )
 

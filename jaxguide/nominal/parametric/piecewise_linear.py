@@ -1,7 +1,7 @@
 """`jg.PiecewiseLinear`: the control as a parameter vector, optimised (thesis, chapter 2)."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of
+from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, minimise, polished, residual
 from jaxguide.nominal.parametric.extremal import flown
@@ -29,7 +30,7 @@ _ITERATIONS = 100
 _TOLERANCE = 1e-12  # scaled KKT residual up to which a solution counts as converged
 
 
-class PiecewiseLinear(eqx.Module):
+class PiecewiseLinear(Method):
     """Suboptimal control: node values of a piecewise-linear control, and a free final time, that
     minimise the cost subject to the endpoint constraints, eqs (2.5)-(2.13).
 
@@ -56,7 +57,11 @@ class PiecewiseLinear(eqx.Module):
     degree: int = eqx.field(static=True)
     starts: int = eqx.field(static=True)
     seed: int = eqx.field(static=True)
-    accuracy = 1e-9  # that its certificates ask for
+    accuracy: ClassVar[float] = 1e-9
+    capabilities: ClassVar[Capabilities] = Capabilities(
+        direct=False, array_guess="the controls at the nodes"
+    )
+    quick = True
 
     def __init__(self, nodes: Any = 9, degree: int = 8, starts: int = 8, seed: int = 0):
         if isinstance(nodes, (int, np.integer)):
@@ -78,18 +83,11 @@ class PiecewiseLinear(eqx.Module):
                     f"PiecewiseLinear: {name}={getattr(self, name)}; need at least {least}."
                 )
 
-    def check_fields(self, problem: Problem) -> None:
-        """Refuses fields that are no parameters of the control. Host only."""
-        kind = type(problem).__name__
-        for name, value in vars(problem).items():
-            if name != "final_time" and name != "initial_state" and is_free(value):
-                raise ValueError(
-                    f"{kind}.{name} is a jg.Free, which PiecewiseLinear does not choose; give it a "
-                    "number, or use jg.Pseudospectral."
-                )
-
     def check(self, problem: Problem) -> None:
-        """Refuses what a parameter optimisation with equalities cannot do. Host only."""
+        """Refuses free initial data, path constraints, and fewer parameters than constraints.
+
+        **Raises:** `ValueError`.
+        """
         kind = type(problem).__name__
         free = initially_free(problem)
         if any(free):
@@ -98,24 +96,17 @@ class PiecewiseLinear(eqx.Module):
                 "PiecewiseLinear starts from a given state; give it a number, or use "
                 "jg.Pseudospectral."
             )
-        for name in ("path_constraints", "integrands"):
-            if count(problem, name):
-                raise ValueError(
-                    f"{kind}.{name}: {count(problem, name)} of them, which PiecewiseLinear does "
-                    "not enforce; leave them out, or use jg.Pseudospectral."
-                )
-        if is_traced((problem.final_time, problem.endpoint_bounds)):
-            return
-        if not is_free(problem.final_time) and np.isinf(np.asarray(problem.final_time)):
-            raise ValueError(f"{kind}.final_time is infinite; PiecewiseLinear needs a finite one.")
-        q = endpoint_count(problem)
-        lo, hi = (np.broadcast_to(np.asarray(b), (q,)) for b in problem.endpoint_bounds)
-        if np.any(lo != hi):
-            i = int(np.argmax(lo != hi))
+        if is_free(problem.initial_time):
             raise ValueError(
-                f"{kind}.endpoint_bounds: constraint {i} is an inequality [{lo[i]}, {hi[i]}]; "
-                "PiecewiseLinear takes equalities: set both to the active value, or leave it out."
+                f"{kind}.initial_time is a jg.Free, which PiecewiseLinear does not choose; give it "
+                "a number, or use jg.Pseudospectral."
             )
+        if paths := count(problem, "path_constraints"):
+            raise ValueError(
+                f"{kind}.path_constraints: {paths} of them, which PiecewiseLinear does not "
+                "enforce; leave them out, or use jg.Pseudospectral."
+            )
+        q = endpoint_count(problem)
         size = self.positions.shape[0] * problem.m + is_free(problem.final_time)
         if size < q:
             raise ValueError(
@@ -123,8 +114,7 @@ class PiecewiseLinear(eqx.Module):
                 f"{q} endpoint constraints; give at least {-(-q // problem.m) + 1} nodes."
             )
 
-    def __call__(self, problem: Problem, guess: Any, certifier: Any) -> Extremal:
-        """The extremal, without host checks; `solve` wraps this. Pure."""
+    def __call__(self, problem: Problem, guess: Any) -> Extremal:
         frozen, positions = jax.lax.stop_gradient((problem, self.positions))
         if guess is None:
             begin = _starts(problem, positions, self.starts, self.seed)
@@ -150,7 +140,6 @@ class PiecewiseLinear(eqx.Module):
             self.positions,
             z.a * units.a,
             z.nu * units.f / units.c,
-            certifier,
             degree=self.degree,
             residual=error,
         )

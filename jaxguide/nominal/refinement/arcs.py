@@ -4,34 +4,33 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxguide.bounds import bounds_of
-from jaxguide.conditions.hamiltonian import hamiltonian
-from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.spectral import legendre_matrix
 from jaxguide.trajectory import Extremal
 
-# As near to a bound as this, of its range, it is active; controls are let off lightly, where short
-# segments give their multipliers little weight.
+# A bound is active where a value comes nearer to it than this share of the distance between the
+# bounds, or of the value's own range. Controls get more room: on short segments their multipliers
+# have little weight, so that the barrier holds them further away. By experiment on the library.
 _NEAR, _NEAR_CONTROL = 1e-4, 1e-2
-# What an arc holds at least, else it is the blur of a junction: nodes, and a share of the horizon.
+_SAME = 1e-12  # a range below this share of the largest value is rounding: the value is constant
+# Shortest run of nodes counted as an arc: 2 nodes and 0.2 % of the horizon (by experiment on the
+# library). A shorter run is a junction seen through a coarse mesh.
 _LEAST, _SHARE = 2, 2e-3
-# Shorter arcs, of the horizon, are what free knots closed: they stop at 1e-6.
+# An arc that free knots made shorter than this share of the horizon is gone. Knots keep 1e-6 apart.
 _CLOSED = 1e-5
-# Multipliers of the wrong sign below this, of their control's largest, are a junction's own error.
+# A multiplier of the wrong sign below this share of its control's largest is the error that a
+# junction leaves at its neighbouring nodes. By experiment on NPSAT1 and the robot arm.
 _ROUNDING = 1e-7
-_SEGMENTS_A_HORIZON = 8  # of the mesh with free knots
-_SMOOTHING = 1e2  # weight of a singular control's roughness, in designer units
 
 
 class Arcs(NamedTuple):
-    """`junctions`: times between arcs. `active`: what each arc holds, component by component: -1 at
-    its lower bound, 1 at its upper, 0 between."""
+    """`junctions`: times between arcs. `active`: by arc and component (controls, states, path
+    constraints), -1 at its lower bound, 1 at its upper, 0 between."""
 
     junctions: Float[np.ndarray, " junction"]
     active: Float[np.ndarray, "arc component"]
@@ -62,16 +61,18 @@ def arcs(extremal: Extremal) -> Arcs:
 def _near(values: Float[np.ndarray, "node k"], bounds: Any, share: float) -> np.ndarray:
     """-1 near the lower bound, 1 near the upper, 0 between."""
     lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
-    near = share * np.minimum(hi - lo, np.ptp(values, axis=0) + 1e-12)
+    span = np.maximum(np.ptp(values, axis=0), _SAME * np.max(np.abs(values), axis=0))
+    near = share * np.minimum(hi - lo, span)
     active = np.where(values - lo <= near, -1, 0) + np.where(hi - values <= near, 1, 0)
     return np.where(hi > lo, active, 0)  # an equality has no arcs
 
 
 def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
-    """`found` with its arcs at `edges` (ends included), but for those that free knots closed."""
+    """`found`, whose arcs free knots have moved to `edges` (ends included), without the arcs that
+    they closed."""
     long = np.diff(edges) >= _CLOSED * (edges[-1] - edges[0])
     keep = np.flatnonzero(long)
-    # Alike once what stood between them is gone: one arc.
+    # Two arcs that hold the same, once the arc between them is gone, are one.
     same = [np.array_equal(found.active[a], found.active[b]) for a, b in zip(keep, keep[1:])]
     first = keep[np.append(True, ~np.array(same, bool))]
     middle = [(edges[a] + edges[b + 1]) / 2 for a, b in zip(first[1:], _before(keep, first))]
@@ -79,9 +80,9 @@ def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
 
 
 def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
-    """`found`, its arcs at `edges` (ends included), with controls that are held at one bound where
-    their multiplier names the other held there instead. Two controls that one junction switches
-    together, for lack of an arc between, come apart: each at its own multiplier's zero."""
+    """`found`, its arcs at `edges` (ends included), corrected by the multipliers of the controls: a
+    control held at one bound goes to the other where the sign of its multiplier says so. Two
+    controls that one junction switches together then switch each at its own multiplier's zero."""
     problem, m = extremal.problem, extremal.problem.m
     nodal = (extremal.t, extremal.x, extremal.u, extremal.multipliers.control)
     t = _own(extremal, extremal.t)
@@ -102,40 +103,6 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
     return _runs(t, labels, least=lambda a, b: True)
 
 
-def laid_out(
-    extremal: Extremal, found: Arcs
-) -> tuple[np.ndarray, tuple[int, ...], np.ndarray, Arcwise]:
-    """A mesh of the arcs `found`: its breaks as fractions of the horizon, which of them are free
-    knots, where the arcs end among them, and what each segment holds."""
-    n, m, junctions = extremal.problem.n, extremal.problem.m, found.junctions
-    affine, switches = _affine(extremal), found.switches(m)
-    t0, tf = float(extremal.t[0]), float(extremal.t[-1])
-    main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
-    breaks, knots, edges = [0.0], [], [0]
-    held, smooth, released, unpathed = [], [], [], []
-    for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
-        # A singular arc gets one polynomial: more would let its control chatter.
-        singular = affine & (found.active[arc, :m] == 0)
-        count = 1 if singular.any() else max(2, int(np.ceil(_SEGMENTS_A_HORIZON * (b - a))))
-        breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
-        held += [found.active[arc, :m].astype(float)] * count
-        smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
-        # With every control held a state bound is implied but for one point, the arc's last.
-        settled = np.all(found.active[arc, :m] != 0)
-        implied = (found.active[arc, m : m + n] != 0) & settled
-        unpathed += [(found.active[arc, m + n :] != 0) & settled] * count
-        if released:
-            released[-1] = released[-1] | np.stack([np.zeros(n, bool), implied])
-        released += [np.stack([implied, implied])] * count
-        released[-1] = np.stack([implied, np.zeros(n, bool)])
-        edges.append(len(breaks) - 1)
-        if arc < len(switches) and switches[arc]:
-            knots.append(len(breaks) - 1)
-    breaks[-1] = 1.0
-    known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released, unpathed)))
-    return np.array(breaks), tuple(knots), np.array(edges), known
-
-
 def _own(extremal: Extremal, values: Any) -> np.ndarray:
     """`values` (node, ...) at the nodes of the quadrature alone, segment after segment."""
     values = np.asarray(values)
@@ -146,7 +113,7 @@ def _own(extremal: Extremal, values: Any) -> np.ndarray:
 
 
 def _before(keep: np.ndarray, first: np.ndarray) -> list[int]:
-    """The last arc that lasts ahead of each but the first of `first`."""
+    """Of each arc in `first` but the first, the last arc of `keep` ahead of it."""
     return [int(keep[np.searchsorted(keep, k) - 1]) for k in first[1:]]
 
 
@@ -160,13 +127,14 @@ def _by_segment(extremal: Extremal):
 
 
 def _cut(t: np.ndarray, labels: np.ndarray) -> Arcs:
-    """Runs of equal labels; short ones are shared out between their neighbours."""
+    """Arcs: runs of equal labels. A short run is divided between its neighbours."""
     labels = np.stack([_calmed(t, column) for column in labels.T], axis=1)
     return _runs(t, labels, functools.partial(_lasts, t))
 
 
 def _runs(t: np.ndarray, labels: np.ndarray, least: Callable[[Any, Any], Any]) -> Arcs:
-    """Runs of equal labels that are `least` long; others are shared out to their neighbours."""
+    """Arcs: runs of equal labels, nodes a ... b - 1, for which `least(a, b)` holds. The others are
+    divided between their neighbours."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.any(np.diff(labels, axis=0), axis=1))])
     ends = np.append(starts[1:], len(t))
     long = [(a, b) for a, b in zip(starts, ends, strict=True) if least(a, b)]
@@ -187,22 +155,10 @@ def _lasts(t: np.ndarray, a: Any, b: Any) -> Any:
 
 
 def _calmed(t: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """One component's labels, runs that are no arcs joined to what came before."""
+    """Labels of one component; a run too short for an arc takes the label before it."""
     starts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(labels)), [len(labels)]])
     out = labels.copy()
     for a, b in zip(starts[1:-1], starts[2:], strict=True):
         if not _lasts(t, a, b):
             out[a:b] = out[a - 1]
     return out
-
-
-@eqx.filter_jit
-def _curvature(extremal: Extremal) -> Float[Array, "node m"]:
-    along = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))
-    at = (extremal.problem, extremal.t, extremal.x, extremal.u, extremal.costate)
-    return jnp.max(jnp.abs(along(*at)), axis=2)
-
-
-def _affine(extremal: Extremal) -> np.ndarray:
-    """Which controls H is linear in."""
-    return np.asarray(jnp.max(_curvature(extremal), axis=0)) <= 1e-12

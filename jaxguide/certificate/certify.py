@@ -1,0 +1,43 @@
+"""How good an extremal is: its Certificate, computed independently of what found it."""
+
+import equinox as eqx
+
+from jaxguide.certificate import checks, costly
+from jaxguide.certificate.along import Along
+from jaxguide.certificate.table import Certificate, Rows
+from jaxguide.trajectory import Extremal
+from jaxguide.transforms.endless import closed
+
+
+def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -> Certificate:
+    """Checks an extremal against the conditions it should meet, independently of its solver.
+
+    **Arguments:** `tolerance`: of the relative errors; `costly`: also fly the interpolated control
+    with an adaptive integrator (Diffrax, 1e-11) and compare with the extremal's own states; and
+    look for conjugate points, past which an extremal minimises nothing, by a backward sweep of its
+    second variation. Errors are relative to the size of what is compared, so the tolerance holds
+    in any units.
+
+    **Source:** 2002 paper, eqs (2)-(9); review, section 4.
+    """
+    return _certified(extremal, costly, tolerance)
+
+
+@eqx.filter_jit
+def _certified(extremal: Extremal, fly: bool, tight: float) -> Certificate:
+    rows, along = Rows(), Along(extremal if extremal.stretch is None else closed(extremal))
+    if fly:
+        costly.flown(rows, along)
+    for check in (
+        checks.canonical,
+        checks.boundary,
+        checks.energy,
+        checks.jumps,
+        checks.stationarity,
+        checks.bounds,
+        checks.integrals,
+        checks.parameters,
+        checks.tails,
+    ):
+        check(rows, along, tight)
+    return rows.done()

@@ -1,0 +1,48 @@
+"""Bounds along a trajectory: how far it oversteps them, and whether their covectors fit.
+
+**Source:** review, eq. (3) and the complementarity conditions after it.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.bounds import overstep, slackness
+from jaxguide.conditions.sizes import Sizes
+from jaxguide.problem import Problem
+
+
+class Bounded(NamedTuple):
+    """By node, relative to sizes: oversteps of path constraints, states and controls, and
+    complementarity of all three, side by side in that order, relative to the Hamiltonian."""
+
+    path: Float[Array, "node p"]
+    state: Float[Array, "node n"]
+    control: Float[Array, "node m"]
+    complementarity: Float[Array, "node p_n_m"]
+
+
+def bounded(
+    problem: Problem,
+    t: Float[Array, " node"],
+    x: Float[Array, "node n"],
+    u: Float[Array, "node m"],
+    multipliers: tuple[Array, Array, Array],
+    size: Sizes,
+) -> Bounded:
+    """`multipliers`: of path constraints, states and controls, (node, k) each."""
+    h = jax.vmap(problem.path_constraints)(t, x, u)
+    kinds: Any = (
+        (h, problem.path_bounds, size.path),
+        (x, problem.state_bounds, size.x),
+        (u, problem.control_bounds, size.u),
+    )
+    path, state, control = (overstep(values, within) / of[None] for values, within, of in kinds)
+    slack = jax.vmap(slackness, in_axes=(0, 0, None, None))
+    signs = [
+        slack(by, values, within, of) * of[None]
+        for by, (values, within, of) in zip(multipliers, kinds, strict=True)
+    ]
+    return Bounded(path, state, control, jnp.concatenate(signs, axis=1) / size.hamiltonian)

@@ -1,0 +1,80 @@
+"""The next mesh: where its breaks go, how many nodes it has, and what the last one left open."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxguide.nominal.direct.unknowns import Arcwise
+from jaxguide.spectral import legendre_matrix
+from jaxguide.trajectory import Extremal
+from jaxguide.types import RESULTS
+
+# How strongly breaks follow the error, and the share that smooth segments keep of the worst one's:
+# first choices, tried on five problems of the library and not tuned.
+_POWER, _FLOOR = 1 / 3, 0.03
+
+
+class MeshStep(NamedTuple):
+    """One solve of the refinement, for `watch`: what was tried, and how good it is.
+
+    `error`: the largest defect between nodes, relative to the states' span (`segment_errors`).
+    """
+
+    step: str
+    extremal: Extremal
+    error: float
+
+    def __str__(self) -> str:
+        e = self.extremal
+        reason = RESULTS[e.result] or "converged"
+        return (
+            f"{self.step}: {len(e.breaks) - 1} segments of degree {e.degree}, "
+            f"objective {float(e.objective):.12g}, defect between nodes {self.error:.1e}, {reason}"
+        )
+
+
+@eqx.filter_jit
+def tails(extremal: Extremal) -> Float[Array, ""]:
+    """Largest of the last two Legendre coefficients of state and costate, relative to their size:
+    by Jackson's theorem (review, section 4.4) what a finer grid could still change."""
+    last = legendre_matrix(extremal.reference_nodes)[-2:]
+    parts = (extremal.by_segment(extremal.x), extremal.costate_by_segment())
+    size = extremal.sizes()
+    tails = [
+        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", last, v)) / of[None, None])
+        for v, of in zip(parts, (size.x, size.costate), strict=True)
+    ]
+    return jnp.maximum(*tails)
+
+
+def moved(
+    fractions: Float[np.ndarray, " edge"], errors: Float[np.ndarray, " segment"], segments: int
+) -> Float[np.ndarray, " new_edge"]:
+    """Breaks of `segments` segments that share the errors more equally."""
+    share = np.maximum((errors / errors.max()) ** _POWER, _FLOOR)
+    total = np.concatenate([[0.0], np.cumsum(share)])
+    new = np.interp(np.linspace(0.0, total[-1], segments + 1), total, fractions)
+    new[0], new[-1] = 0.0, 1.0
+    return new
+
+
+def fractions_of(extremal: Extremal) -> Float[np.ndarray, " edge"]:
+    """Its breaks as fractions of the horizon."""
+    breaks = np.asarray(extremal.breaks)
+    return (breaks - breaks[0]) / (breaks[-1] - breaks[0])
+
+
+def remeshed(
+    method: Any,
+    fractions: Float[np.ndarray, " edge"],
+    nodes: int,
+    knots: tuple[int, ...] = (),
+    arcwise: Arcwise | None = None,
+) -> Any:
+    """`method` on another mesh, from one start."""
+    changed: dict[str, Any] = {"nodes": nodes, "segments": len(fractions) - 1, "starts": 1}
+    return dataclasses.replace(method, fractions=fractions, knots=knots, arcwise=arcwise, **changed)
