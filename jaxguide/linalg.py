@@ -137,3 +137,11 @@ class SmallLU(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return True
+
+
+def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The power of two nearest to `size` (1 where that is 0 or not finite): a unit by which nothing
+    is rounded."""
+    usable = (size > 0) & jnp.isfinite(size)
+    exponent = jnp.round(jnp.log2(jnp.where(usable, size, 1.0))).astype(jnp.int32)
+    return jnp.where(usable, jnp.ldexp(jnp.ones_like(size), exponent), 1.0)

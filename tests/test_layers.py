@@ -58,6 +58,8 @@ ORDER: dict[str, tuple[str, ...]] = {
     "transforms": ("wrapped", "integrals", "relaxed", "endless", "phased", "state_as_time"),
     "nominal": (
         "steps",
+        "roots",
+        "starts",
         "defects",
         "method",
         "guesses",
@@ -84,7 +86,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "warm",
         "pseudospectral",
     ),
-    "nominal.indirect": ("boundary", "coarse", "starts", "shooting"),
+    "nominal.indirect": ("boundary", "coarse", "starts", "guess", "laying", "shot", "shooting"),
     "nominal.parametric": ("flow", "equality", "extremal", "piecewise_linear"),
     "nominal.refinement": ("arcs", "layout", "meshes", "soundness", "structured", "refine"),
     "neighboring": (

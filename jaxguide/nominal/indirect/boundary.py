@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxguide.bounds import bounds_of
 from jaxguide.conditions.canonical import optimal_hamiltonian
 from jaxguide.conditions.hamiltonian import endpoint_lagrangian
+from jaxguide.conditions.sizes import Sizes
 from jaxguide.problem import Problem, initial_values, initially_free, is_free
 
 
@@ -53,3 +54,24 @@ def boundary_residual(problem: Problem, z: Unknowns, ends: Float[Array, "arc two
     if is_free(problem.initial_time):
         parts.append((optimal_hamiltonian(problem, t0, z.starts[0]) - g_t0)[None])
     return jnp.concatenate(parts)
+
+
+def unknown_sizes(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Unknowns:
+    """How large each unknown is: states and costates by their largest value at the arcs' ends, nu
+    by its largest entry, free times by the horizon; zero where they all vanish."""
+    t0, tf = horizon(problem, z)
+    both = jnp.abs(jnp.concatenate([z.starts, ends[:, : 2 * problem.n]]))
+    largest = jnp.broadcast_to(jnp.max(both, axis=0), z.starts.shape)
+    nu = jnp.broadcast_to(jnp.max(jnp.abs(z.nu), initial=0.0), z.nu.shape)
+    span = jnp.abs(tf - t0)
+    return Unknowns(largest, nu, jnp.full_like(z.t0, span), jnp.full_like(z.tf, span))
+
+
+def boundary_sizes(problem: Problem, arcs: int, size: Sizes) -> Float[Array, " condition"]:
+    """How large each entry of `boundary_residual` may be: what its error is relative to."""
+    of_state = jnp.concatenate([size.x, size.costate])
+    free = jnp.asarray(initially_free(problem))
+    start = jnp.where(free, size.costate, size.x)
+    times = [t for t in (problem.final_time, problem.initial_time) if is_free(t)]
+    energy = jnp.broadcast_to(size.hamiltonian, (len(times),))
+    return jnp.concatenate([start, jnp.tile(of_state, arcs - 1), size.end, size.costate, energy])

@@ -1,14 +1,22 @@
 """Shooting with coarse steps: a damped Newton iteration in fixed shapes and without LAPACK."""
 
+import jax
 import jax.flatten_util
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.conditions.canonical import canonical_rates
 from jaxguide.linalg import solve
-from jaxguide.nominal.indirect.boundary import Unknowns, boundary_residual, horizon
+from jaxguide.nominal.indirect.boundary import Unknowns, boundary_residual, horizon, unknown_sizes
 from jaxguide.nominal.steps import rk4
 from jaxguide.problem import Problem, is_free
+
+# Residual, relative to what a change of every unknown by its size would do to it, below which the
+# iteration ends, and below which it counts as converged: coarse steps are off by more than either.
+_SETTLED, CONVERGED = 1e-9, 1e-7
+_RISE = 2.0  # a residual may rise by this factor: Newton often climbs before it falls
+_SHORTER, _SHORTEST = 0.3, 1e-3  # of a refused step; where no step is left
+_ITERATIONS = 60
 
 
 def coarse_ends(problem: Problem, z: Unknowns, steps: int) -> Float[Array, "arc two_n_1"]:
@@ -23,21 +31,22 @@ def coarse_ends(problem: Problem, z: Unknowns, steps: int) -> Float[Array, "arc 
     return jax.vmap(flow)(y, times[index])
 
 
-def damped_newton(
-    problem: Problem, z: Unknowns, steps: int, iterations: int
-) -> tuple[Unknowns, Array, Array]:
-    """Newton on the coarse boundary conditions: z, max|residual| and the endpoint cost + integral.
+def damped_newton(problem: Problem, z: Unknowns, steps: int) -> tuple[Unknowns, Array, Array]:
+    """Newton on the coarse boundary conditions.
+
+    **Returns:** the unknowns, their relative residual, and the objective.
 
     Each pass evaluates residual and Jacobian once, at a trial point; a trial that is worse is
     retried with a shorter step. One evaluation in the loop keeps the program small.
     """
     flat, unravel = jax.flatten_util.ravel_pytree(z)
 
-    def residual(v: Array) -> tuple[Array, tuple[Array, Array]]:
+    def residual(v: Array) -> tuple[Array, tuple[Array, Array, Array]]:
         z = unravel(v)
         ends = coarse_ends(problem, z, steps)
         r = boundary_residual(problem, z, ends)
-        return r, (r, objective(problem, z, ends))
+        size = jax.flatten_util.ravel_pytree(unknown_sizes(problem, z, ends))[0]
+        return r, (r, objective(problem, z, ends), size)
 
     def clipped(v: Array) -> Array:
         z = unravel(v)
@@ -50,31 +59,25 @@ def damped_newton(
         return jax.flatten_util.ravel_pytree(z)[0]
 
     def body(carry: tuple) -> tuple:
-        v, dv, step, best, cost, k = carry
+        v, dv, step, left, cost, k = carry
         trial = clipped(v + step * dv)
-        jacobian, (r, trial_cost) = jax.jacfwd(residual, has_aux=True)(trial)
-        size = jnp.max(jnp.abs(r))
-        size = jnp.where(jnp.isfinite(size), size, jnp.inf)
-        # Accept even a slight rise: Newton often climbs before it falls.
-        better = size < 2.0 * best
+        jacobian, (r, trial_cost, size) = jax.jacfwd(residual, has_aux=True)(trial)
+        of = jnp.abs(jacobian) @ size
+        relative = jnp.max(jnp.abs(r) / jnp.where(of > 0, of, 1.0))
+        relative = jnp.where(jnp.isfinite(relative), relative, jnp.inf)
+        better = relative < _RISE * left
         v = jnp.where(better, trial, v)
         dv = jnp.where(better, -solve(jacobian, r), dv)
-        step = jnp.where(better, 1.0, 0.3 * step)
-        best = jnp.where(better, size, best)
-        return v, dv, step, best, jnp.where(better, trial_cost, cost), k + 1
+        step = jnp.where(better, 1.0, _SHORTER * step)
+        left = jnp.where(better, relative, left)
+        return v, dv, step, left, jnp.where(better, trial_cost, cost), k + 1
 
     one = jnp.ones((), flat.dtype)
-    start = (
-        flat,
-        jnp.zeros_like(flat),
-        one,
-        jnp.inf * one,
-        jnp.inf * one,
-        jnp.zeros((), jnp.int32),
-    )
-    going = lambda c: (c[3] > 1e-9) & (c[2] > 1e-3) & (c[5] < iterations)
-    v, _, _, norm, cost, _ = jax.lax.while_loop(going, body, start)
-    return unravel(v), norm, cost
+    far = jnp.inf * one
+    start = (flat, jnp.zeros_like(flat), one, far, far, jnp.zeros((), jnp.int32))
+    going = lambda c: (c[3] > _SETTLED) & (c[2] > _SHORTEST) & (c[5] < _ITERATIONS)
+    v, _, _, left, cost, _ = jax.lax.while_loop(going, body, start)
+    return unravel(v), left, cost
 
 
 def objective(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:

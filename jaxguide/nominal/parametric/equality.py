@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.linalg import SmallLU, cholesky_positive, solve
+from jaxguide.linalg import cholesky_positive, solve
+from jaxguide.nominal.roots import implicit_root
 
 Values = Callable[[Array, Any], tuple[Array, Array]]  # (a, args) -> f, c
 
@@ -138,14 +138,4 @@ def minimise(
 
 def polished(values: Values, z: KKTPoint, args: Any) -> KKTPoint:
     """`z` by Newton to rounding; differentiable in `args`, implicitly, forward and reverse."""
-    root = optx.root_find(
-        lambda z, args: conditions(values, z, args),
-        optx.Newton(rtol=1e-13, atol=1e-13, linear_solver=SmallLU()),
-        z,
-        args,
-        max_steps=12,
-        adjoint=optx.ImplicitAdjoint(linear_solver=SmallLU()),
-        throw=False,
-    ).value
-    ok = jnp.all(jnp.isfinite(jnp.concatenate(root)))
-    return KKTPoint(*(jnp.where(ok, new, old) for new, old in zip(root, z, strict=True)))
+    return implicit_root(lambda z, args: conditions(values, z, args), z, args, 1e-13, 12)
