@@ -11,9 +11,12 @@ from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
 from jaxguide import problems
-from jaxguide.nominal.direct import elimination, kkt_factor, kkt_step, newton_system
+from jaxguide.nominal.direct import newton_system
 from jaxguide.nominal.direct.collocation import FAMILIES, collocation, left_null
+from jaxguide.nominal.direct.elimination import eliminate
 from jaxguide.nominal.direct.guess import edges
+from jaxguide.nominal.direct.kkt_factor import factorise
+from jaxguide.nominal.direct.kkt_step import newton_step
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Equations, Primal, Scale
 from jaxguide.problems import EarthMars
@@ -62,7 +65,7 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     fractions = jnp.linspace(0.0, 1.0, segments + 1) ** 1.2
     program = Transcription(Everything(), scale, edges(fractions, knots), family, points)
     times = jnp.array([0.0, 1.6, *(0.5,) * len(knots)])
-    size, rng = program.sizes, np.random.default_rng(0)
+    size, rng = program.counts, np.random.default_rng(0)
     r = lambda *shape: jnp.asarray(rng.normal(size=shape)) * 0.1
     random = lambda tree: jax.tree_util.tree_map(lambda a: r(*a.shape), tree)
     w = Primal(
@@ -86,8 +89,8 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
         nodes, ends = program.derivatives(w)
         _, c = program.objective_and_residual(w)
         system = newton_system.NewtonSystem(nodes, ends, *program.hessians(w, y), sigma, given)
-        parts = elimination.eliminate(program, system)
-        factor, ok = kkt_factor.factorise(program, system, parts, delta, jnp.asarray(5.0))
+        parts = eliminate(program, system)
+        factor, ok = factorise(program, system, parts, delta, jnp.asarray(5.0))
         objective = newton_system.lagrangian_gradient(
             program, nodes, ends, w, jax.tree_util.tree_map(jnp.zeros_like, y)
         )
@@ -95,7 +98,7 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
         load = newton_system.Load(
             force, c._replace(path=c.path + newton_system.COMPLIANCE * y.path)
         )
-        return kkt_step.newton_step(program, system, parts, factor, load), ok
+        return newton_step(program, system, parts, factor, load), ok
 
     flat, unravel = ravel_pytree(w)
     objective = lambda v: program.objective_and_residual(unravel(v))[0]

@@ -25,6 +25,7 @@ from jaxguide.nominal.direct.newton_system import (
     times_step,
 )
 from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.trees import largest
 from jaxguide.nominal.direct.unknowns import Primal
 
 _tree = jax.tree_util.tree_map
@@ -84,10 +85,8 @@ def _implicit_step(
     nodes, ends = program.derivatives(w)
     system = NewtonSystem(nodes, ends, *program.hessians(w, solution.y), sigma, given)
     segments = eliminate(program, system)
-    largest = jnp.max(jnp.abs(system.node_hessian), initial=0.0)
-    factor, _ = factorise(
-        program, system, segments, zero, PENALTY * (1 + largest(system.node_hessian))
-    )
+    rho = PENALTY * (1 + largest(system.node_hessian))
+    factor, _ = factorise(program, system, segments, zero, rho)
 
     # One flat vector: transposition wants a right-hand side that is linear as a whole.
     right = Step(_tree(jnp.negative, load.force), _tree(jnp.negative, load.residual))

@@ -22,8 +22,8 @@ from jaxguide.nominal.direct.newton_system import NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Counts
 
-# Curvature of the penalty on the final state's gap in the sweep, relative to the largest entry of the
-# Hessian. A choice: it need only make the sweep convex, as the multiplier beside it closes the gap.
+# Curvature of the penalty on the final state's gap in the sweep, relative to the Hessian's largest
+# entry. A choice: it need only make the sweep convex, as the multiplier beside it closes the gap.
 PENALTY = 1e2
 # Softness lent to the multipliers of the last system, relative to its largest entries, so that a
 # redundant constraint does not make it singular. A choice, some 1e5 roundings: refinement takes it

@@ -34,7 +34,7 @@ class NewtonSystem(NamedTuple):
     nodes: Nodes
     ends: Ends
     node_hessian: Float[Array, "segment node in in"]
-    end_hessian: Float[Array, "in in"]
+    end_hessian: Float[Array, "end end"]
     sigma: Primal
     given: Primal
 
@@ -85,7 +85,7 @@ def times_step(
 
 def forces(
     program: Transcription, nodes: Nodes, ends: Ends, y: Equations, cost: float
-) -> tuple[Float[Array, "segment node in"], Float[Array, " in"], Float[Array, "segment support n"]]:
+) -> tuple[Float[Array, "segment node in"], Float[Array, " end"], Float[Array, "segment point n"]]:
     """Derivatives of `cost` f + y^T c with respect to the nodes' inputs, the endpoint inputs and
     (of the defects' part A X alone) the states at the support points."""
     n = program.counts.n

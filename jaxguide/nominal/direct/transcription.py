@@ -219,8 +219,8 @@ class Transcription(eqx.Module):
     def hessians(
         self, w: Primal, y: Equations
     ) -> tuple[Float[Array, "segment node in in"], Float[Array, "end end"]]:
-        """Second derivatives of the Lagrangian f + y^T c with respect to `inputs`, node by node, and
-        of its endpoint part with respect to `end_inputs`."""
+        """Second derivatives of the Lagrangian f + y^T c: with respect to `inputs`, node by node,
+        and, of its endpoint part, with respect to `end_inputs`."""
         weights = self.node_weights(y)
         node = lambda tau, w, q, c: jnp.dot(c, self.node(tau, w, q))
         over = jax.vmap(jax.vmap(hessian(node, 2)), in_axes=(None, None, 0, 0))

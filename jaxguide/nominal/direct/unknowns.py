@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxguide.problem import Problem, count
 
@@ -28,7 +28,7 @@ class Primal(NamedTuple):
     end: Float[Array, " q"]
 
 
-def flattened(w: Primal) -> Float[Array, " unknown"]:
+def flattened(w: Primal) -> Shaped[Array, " unknown"]:
     """All entries as one vector; `Transcription.shaped` undoes it."""
     return jnp.concatenate([a.reshape(-1) for a in w])
 

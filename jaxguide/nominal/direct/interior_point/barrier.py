@@ -1,7 +1,7 @@
 """The barrier parameter mu: the monotone rule, the free rule by Mehrotra's probe, and tau.
 
-**Source:** Waechter & Biegler (2006), eqs (7) and (8); Nocedal, Waechter & Waltz (2009) for the free
-rule. Where a constant is Ipopt's, it is the default of that option.
+**Source:** Waechter & Biegler (2006), eqs (7) and (8); for the free rule Nocedal, Waechter & Waltz
+(2009). Where a constant is Ipopt's, it is the default of that option.
 """
 
 from typing import NamedTuple

@@ -80,14 +80,15 @@ class Aim(NamedTuple):
 
 class Found(NamedTuple):
     """What the search ends with: the barrier and its filter, the uncorrected step, the step taken
-    and its length, the barrier function `phi` before it, whether it is `accepted`, and as an f-type
-    step; `regular`: whether the step could be computed at all."""
+    and its length, violation `theta` and barrier function `phi` before it, whether it is
+    `accepted`, and as an f-type step; `regular`: whether the step could be computed at all."""
 
     mu: Float[Array, ""]
     filter: Filter
     step: Move
     taken: Move
     alpha: Float[Array, ""]
+    theta: Float[Array, ""]
     phi: Float[Array, ""]
     regular: Bool[Array, ""]
     accepted: Bool[Array, ""]
@@ -119,7 +120,7 @@ def searched(
     accepted = regular & found & ~kind.estimate
     taken, alpha = choose(aim.accepted, aim.latest, (step, alpha))
     phi = at.f + aim.mu * logs
-    return Found(aim.mu, filter, step, taken, alpha, phi, regular, accepted, f_type)
+    return Found(aim.mu, filter, step, taken, alpha, search.theta, phi, regular, accepted, f_type)
 
 
 def _aimed(search: Search) -> Aim:

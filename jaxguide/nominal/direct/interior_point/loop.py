@@ -90,9 +90,8 @@ def _advanced(setup: Setup, s: State) -> State:
     done = at.kind.newton & (now <= setup.options.tolerance)  # Waechter & Biegler (2006), eq. (6)
     converged = s._replace(status=s.status * 0 + CONVERGED, iteration=s.iteration + 1, error=now)
     none = jnp.zeros_like(s.mu)
-    new, delta, alpha = jax.lax.cond(
-        done, lambda: (converged, none, none), lambda: _step(setup, at)
-    )
+    stop, go_on = lambda: (converged, none, none), lambda: _step(setup, at)
+    new, delta, alpha = jax.lax.cond(done, stop, go_on)
     program = setup.program
     if program.log:
         numbers = (s.iteration, at.f, largest(at.c), now, new.mu, delta, alpha)

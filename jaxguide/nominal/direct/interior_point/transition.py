@@ -63,13 +63,12 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
     """The state after the step that the line search found."""
     s, kind, options = at.state, at.kind, setup.options
     point = _moved(setup, at, barrier, found)
-    theta = one_norm(at.c)
     outcome = _outcome(setup, at, point, found)
     mode = jnp.where((kind.restore & ~outcome.home) | outcome.into, RESTORE, NEWTON)
     mode = jnp.where(outcome.home, ESTIMATE, mode)
-    # Steps that are not of f-type, and the point that restoration leaves, join the filter: eq. (22).
+    # Eq. (22): for a step that is not of f-type, and for the point that restoration leaves.
     add = (found.accepted & kind.newton & ~found.f_type) | outcome.into
-    filter = augmented(found.filter, theta, found.phi, add)
+    filter = augmented(found.filter, found.theta, found.phi, add)
     return State(
         w=point.w,
         y=point.y,
@@ -79,7 +78,7 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
         filter=filter,
         theta_max=s.theta_max,
         theta_min=s.theta_min,
-        theta_entry=jnp.where(outcome.into, theta, s.theta_entry),
+        theta_entry=jnp.where(outcome.into, found.theta, s.theta_entry),
         delta=matrix.needed,
         mode=mode.astype(s.mode.dtype),
         iteration=s.iteration + 1,
