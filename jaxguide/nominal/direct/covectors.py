@@ -45,7 +45,8 @@ def to_extremal(
     chosen, problem = choices(problem), with_parameters(problem, w.p * scale.p)
     n, m = problem.n, problem.m
     covectors = costates(program, limits, solution)
-    u = _controls(problem, program, limits, solution)
+    spread = _spread(program)
+    u = _controls(problem, program, limits, solution, spread)
     x = whole(program.support(w))[:, :n] * scale.x[None, :n]
     to_user = (scale.objective / scale.x)[None, :n]
     f, _ = program.objective_and_residual(w)
@@ -60,7 +61,7 @@ def to_extremal(
         costate_before=covectors.before[:, :n] * to_user,
         final_time=w.times[1] * scale.t,
         objective=f * scale.objective,
-        multipliers=_multipliers(problem, program, limits, solution, covectors.jump),
+        multipliers=_multipliers(problem, program, limits, solution, covectors.jump, spread),
         result=_result(problem, program, solution, f, residual),
         residual=residual,
         degenerate=_undecided(limits, solution),
@@ -89,12 +90,15 @@ def _spread(program: Transcription) -> Float[Array, "support node"]:
 
 
 def _controls(
-    problem: Problem, program: Transcription, limits: Limits, solution: interior_point.Solution
+    problem: Problem,
+    program: Transcription,
+    limits: Limits,
+    solution: interior_point.Solution,
+    spread: Float[Array, "support node"],
 ) -> Float[Array, "segment support m"]:
     """Controls at the support points, scaled, within their bounds; unbounded angles unwrapped, so
     that they are smooth where they are extrapolated."""
     counts, rule, scale, w = program.counts, program.rule, program.scale, solution.w
-    spread = _spread(program)
     at_nodes = node_times(program, w, rule.nodes).reshape(-1)
     own = slice(rule.first, rule.first + counts.nodes)
     x_nodes = program.support(w)[:, own].reshape(-1, counts.n) * scale.x[None]
@@ -115,6 +119,7 @@ def _multipliers(
     limits: Limits,
     solution: interior_point.Solution,
     jump: Float[Array, "segment n"],
+    spread: Float[Array, "support node"],
 ) -> Multipliers:
     """Multipliers of all constraints, in user units; those along the trajectory as densities in
     time, the program's multipliers over weight and dt/dtau, as Proposition 1 has it of costates."""
@@ -127,7 +132,6 @@ def _multipliers(
     # A break belongs to the segment that has it as a node: the one before it, for "lgr-right".
     ahead = lambda a: jnp.concatenate([a[0, :1], jnp.concatenate(a[:, 1:])])
     owned = ahead if rule.first else whole
-    spread = _spread(program)
     over_nodes = lambda a: owned(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
     # A given control has no bounds' multipliers: its own is what the Lagrangian's gradient leaves.
     nodes, ends = program.derivatives(w)

@@ -49,7 +49,7 @@ class Layout(NamedTuple):
     theta: int  # how many there are
 
 
-class Stage(NamedTuple):
+class SweepStage(NamedTuple):
     """A segment of the backward sweep; theta: see `Layout`.
 
     - `factor`: Cholesky of the Hessian by z. `N`: mixed Hessian by z and theta. `KN`: its feedback,
@@ -80,7 +80,7 @@ class Factor(NamedTuple):
     W: Float[Array, "segment node in in"]
     delta: Float[Array, ""]
     rho: Float[Array, ""]
-    stages: Stage
+    stages: SweepStage
     eigenvalues: Float[Array, " k"]
     vectors: Float[Array, "k k"]
     equilibrium: Float[Array, " k"]
@@ -134,7 +134,7 @@ def factorise(
 
 def _sweep(
     program: Transcription, segments: Segments, H: Array, rho: Array
-) -> tuple[Stage, Array, Bool[Array, ""]]:
+) -> tuple[SweepStage, Array, Bool[Array, ""]]:
     """Minimises over the free directions, last segment first: the stages, the Hessian of the value
     before the first segment, and whether every minimum exists."""
     counts, dtype = program.counts, H.dtype
@@ -143,7 +143,7 @@ def _sweep(
     controls = slice(n, n + nu)
     rest = jnp.concatenate([jnp.arange(n), jnp.arange(n + nu, H.shape[1])])  # of v: all but z
 
-    def back(carry: tuple, item: tuple) -> tuple[tuple, Stage]:
+    def back(carry: tuple, item: tuple) -> tuple[tuple, SweepStage]:
         P, ok = carry
         X, H, L = item
         X_u, X_t = X[:, controls], X[:, rest] @ L
@@ -155,7 +155,7 @@ def _sweep(
         ok = ok & jnp.all(jnp.isfinite(factor))
         KN = cho_solve((factor, True), N)
         Q = Q - N.T @ KN
-        return ((Q + Q.T) / 2, ok), Stage(factor, N, KN, X_u, X_t, L, P)
+        return ((Q + Q.T) / 2, ok), SweepStage(factor, N, KN, X_u, X_t, L, P)
 
     start = (_final_value(at, rho, n, dtype), jnp.array(True))
     items = (segments.X[:, -1], H, _to_segments(program, at, dtype))

@@ -41,8 +41,8 @@ _KAPPA_RESTO, _FEASIBLE = 0.9, 10
 _LEAST_VIOLATION = 1e-8
 
 
-class Point(NamedTuple):
-    """Unknowns and multipliers."""
+class Moved(NamedTuple):
+    """Unknowns and multipliers after a step."""
 
     w: Float[Array, " unknown"]
     y: Equations
@@ -50,9 +50,9 @@ class Point(NamedTuple):
     zu: Float[Array, " unknown"]
 
 
-class Outcome(NamedTuple):
-    """Of a step: whether restoration is over (`home`), whether it must begin (`into`), or whether
-    it failed (`stuck`)."""
+class Restoration(NamedTuple):
+    """What a step means for feasibility restoration: whether it is over (`home`), must begin
+    (`into`), or failed (`stuck`)."""
 
     home: Bool[Array, ""]
     into: Bool[Array, ""]
@@ -63,11 +63,11 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
     """The state after the step that the line search found."""
     s, kind, options = at.state, at.kind, setup.options
     point = _moved(setup, at, barrier, found)
-    outcome = _outcome(setup, at, point, found)
-    mode = jnp.where((kind.restore & ~outcome.home) | outcome.into, RESTORE, NEWTON)
-    mode = jnp.where(outcome.home, ESTIMATE, mode)
+    restoration = _restoration_after(setup, at, point, found)
+    mode = jnp.where((kind.restore & ~restoration.home) | restoration.into, RESTORE, NEWTON)
+    mode = jnp.where(restoration.home, ESTIMATE, mode)
     # Eq. (22): for a step that is not of f-type, and for the point that restoration leaves.
-    add = (found.accepted & kind.newton & ~found.f_type) | outcome.into
+    add = (found.accepted & kind.newton & ~found.f_type) | restoration.into
     filter = augmented(found.filter, found.theta, found.phi, add)
     return State(
         w=point.w,
@@ -78,18 +78,18 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
         filter=filter,
         theta_max=s.theta_max,
         theta_min=s.theta_min,
-        theta_entry=jnp.where(outcome.into, found.theta, s.theta_entry),
+        theta_entry=jnp.where(restoration.into, found.theta, s.theta_entry),
         delta=matrix.needed,
         mode=mode.astype(s.mode.dtype),
         iteration=s.iteration + 1,
-        status=_status(options, at, outcome).astype(s.status.dtype),
+        status=_status(options, at, restoration).astype(s.status.dtype),
         error=at.error_now,
         free=barrier.free,
         errors=barrier.errors,
     )
 
 
-def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Point:
+def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Moved:
     """The new iterate, if the step was accepted; new multipliers alone, after an estimate.
 
     **Source:** Waechter & Biegler (2006), eqs (14)-(16); section 3.6 for the estimate.
@@ -111,10 +111,10 @@ def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Point:
     estimated = choose(modest, found.step.dual, zeros_like(s.y))
     new_y = choose(kind.estimate, estimated, choose(found.accepted & ~kind.restore, y, s.y))
     new_zl, new_zu = choose(found.accepted, (zl, zu), (s.zl, s.zu))
-    return Point(choose(found.accepted, w, s.w), new_y, new_zl, new_zu)
+    return Moved(choose(found.accepted, w, s.w), new_y, new_zl, new_zu)
 
 
-def _outcome(setup: Setup, at: Iterate, point: Point, found: Found) -> Outcome:
+def _restoration_after(setup: Setup, at: Iterate, point: Moved, found: Found) -> Restoration:
     """Whether restoration begins, ends or fails.
 
     **Source:** Waechter & Biegler (2006), section 3.3.
@@ -129,15 +129,15 @@ def _outcome(setup: Setup, at: Iterate, point: Point, found: Found) -> Outcome:
         largest(c) <= options.tolerance / _FEASIBLE
     )
     failed = ~found.accepted & ~kind.estimate
-    return Outcome(
+    return Restoration(
         found.accepted & kind.restore & home, failed & kind.newton, failed & kind.restore
     )
 
 
-def _status(options: Options, at: Iterate, outcome: Outcome) -> Int[Array, ""]:
+def _status(options: Options, at: Iterate, restoration: Restoration) -> Int[Array, ""]:
     """Whether the iterations go on, or why not."""
     feasible = largest(at.c) <= jnp.maximum(_LEAST_VIOLATION, options.tolerance)
-    status = jnp.where(outcome.stuck, jnp.where(feasible, STALLED, INFEASIBLE), RUNNING)
-    status = jnp.where(outcome.into & feasible, STALLED, status)
+    status = jnp.where(restoration.stuck, jnp.where(feasible, STALLED, INFEASIBLE), RUNNING)
+    status = jnp.where(restoration.into & feasible, STALLED, status)
     last = at.state.iteration + 1 >= options.max_iterations
     return jnp.where(last & (status == RUNNING), TOO_MANY, status)
