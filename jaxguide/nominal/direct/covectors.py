@@ -22,8 +22,8 @@ from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
 
-# Distance, in designer units, at which a state counts as on its bound. A choice: some hundred times
-# what the last barrier leaves.
+# Distance, in designer units, at which a state counts as on its bound. The last barrier mu leaves a
+# distance mu/z: with mu = 1e-10, the default's, less than this where the multiplier z is above 1e-4.
 _ON_BOUND = 1e-6
 # Factor of sqrt(mu) below which a distance or a multiplier is small. By derivation: the relative
 # error of the barrier's derivative is mu/z^2, a hundredth at this factor.
@@ -202,8 +202,8 @@ class Costates(NamedTuple):
 
 
 def costates(program: Transcription, limits: Limits, solution: interior_point.Solution) -> Costates:
-    """Costates lambda_i of problem B^{lambda N}, eq. (24), from the defect multipliers y of the
-    Lagrangian f + y^T (A X - B F); their interpolant, eq. (23), is the Extremal's.
+    """Costates lambda_i of problem B^{lambda N} from the defect multipliers y of the Lagrangian
+    f + y^T (A X - B F). The Extremal interpolates between them, review, eq. (23).
 
     At a segment's start the costate is what the derivative of the Lagrangian with respect to the
     state there gives (the closure condition). LGL and CGL solutions carry besides a multiple of the

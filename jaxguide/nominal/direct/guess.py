@@ -26,7 +26,7 @@ from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import evened
 
 # Constant controls that are tried where states rest, from the middle of a control's range and as
-# shares of it: by experiment on the brachistochrone, whose start is singular at rest.
+# shares of it: chosen for the brachistochrone, whose start is singular at rest.
 _SHARES = (0.0, -0.25, 0.25)
 # Newton steps towards ends that meet the endpoint constraints, and the ridge that keeps redundant
 # constraints solvable. Choices: a guess need be no better.

@@ -65,10 +65,12 @@ def barrier_of(setup: Setup, at: Iterate, delta: Float[Array, ""]) -> Barrier:
     free = newton & (delta == 0) & falls & (s.mu <= _NEAR)
     errors = jnp.where(free, jnp.roll(s.errors, 1).at[0].set(now), s.errors)
     held = jnp.where(newton & s.free & ~free, jnp.maximum(least, _HELD * gap), s.mu)
-    lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))  # eq. (7)
+    # Waechter & Biegler (2006), eq. (7).
+    lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
     solved = lambda mu: newton & ~free & (at.error(mu) <= _KAPPA_EPS * mu) & (mu > least)
     mu = jax.lax.while_loop(solved, lower, held)
-    tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(free, now, mu))  # eq. (8)
+    # Waechter & Biegler (2006), eq. (8); with a free barrier the error stands for mu.
+    tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(free, now, mu))
     return Barrier(mu, free, tau, gap, errors)
 
 

@@ -34,7 +34,8 @@ from jaxguide.nominal.direct.unknowns import Equations, Primal, flattened
 _DELTA_MIN, _DELTA_FIRST, _FALL, _GROW, _GROW_FIRST = 1e-20, 1e-4, 3, 8.0, 100.0
 # Theirs, delta_w^max, is 1e40; with 1e12 the Hessian is already lost in rounding.
 _DELTA_MAX = 1e12
-# Curvature lent to free knots, lest one that nothing needs wander: the best of five values tried.
+# Curvature lent to free knots, lest one that nothing needs wander. By experiment, the best of five
+# values tried on such knots.
 _IDLE = 1e-3
 
 

@@ -13,7 +13,8 @@ from jaxguide.nominal.direct.trees import choose
 
 # gamma_theta and gamma_phi, margins of sufficient progress: Waechter & Biegler (2006), eq. (18).
 GAMMA = 1e-5
-# Pairs that the filter holds; the oldest makes way. A choice: more than a solve adds to it.
+# Pairs that the filter holds; the oldest makes way. A choice: the filter empties whenever the
+# barrier changes.
 _SLOTS = 128
 
 

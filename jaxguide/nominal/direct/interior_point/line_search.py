@@ -136,7 +136,8 @@ def _aimed(search: Search) -> Aim:
         probe = now.count < 0
         load = loaded(setup, at, gradients, now.target, jnp.where(probe, 0.0, now.mu))
         step = direction(setup, matrix, load)
-        inside = longest_step(at.low, at.high, step.primal, setup.box, barrier.tau)  # eq. (15a)
+        # Waechter & Biegler (2006), eq. (15a).
+        inside = longest_step(at.low, at.high, step.primal, setup.box, barrier.tau)
         length = jnp.minimum(inside, patient_length(setup.program, s.w, step.primal))
         first = choose(now.count == 0, (step, length), now.first)
         slope = _slope(search, now.mu, first[0].primal)
@@ -174,10 +175,12 @@ def judged(
     f, c = program.objective_and_residual(program.shaped(w))
     theta_new, phi_new = one_norm(c), f + barrier_value(box, w, mu)
     sane = jnp.isfinite(theta_new) & jnp.isfinite(phi_new) & (theta_new <= s.theta_max)
-    switch = alpha * steep**_S_PHI > _DELTA * theta**_S_THETA  # eq. (19)
+    # Waechter & Biegler (2006): the switching condition, eq. (19); Armijo's, eq. (20); sufficient
+    # progress, eq. (18).
+    switch = alpha * steep**_S_PHI > _DELTA * theta**_S_THETA
     f_type = (slope < 0) & switch & (theta <= s.theta_min)
-    armijo = phi_new <= phi + _ETA * alpha * slope + slack  # eq. (20)
-    progress = (theta_new <= (1 - GAMMA) * theta) | (phi_new <= phi - GAMMA * theta + slack)  # (18)
+    armijo = phi_new <= phi + _ETA * alpha * slope + slack
+    progress = (theta_new <= (1 - GAMMA) * theta) | (phi_new <= phi - GAMMA * theta + slack)
     good = jnp.where(f_type, armijo, progress)
     good = good & acceptable(filter_under(s, mu), theta_new, phi_new - slack)
     nearer = theta_new <= (1 - _NEARER * alpha) * theta
@@ -200,5 +203,5 @@ def patient_length(program: Transcription, w: Array, d: Array) -> Float[Array, "
 
 
 def _slope(search: Search, mu: Array, d: Array) -> Array:
-    """Of the barrier function along `d`."""
+    """Slope of the barrier function along `d`."""
     return jnp.dot(search.gradients.objective + mu * search.gradients.barrier, d)

@@ -66,7 +66,8 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
     restoration = _restoration_after(setup, at, point, found)
     mode = jnp.where((kind.restore & ~restoration.home) | restoration.into, RESTORE, NEWTON)
     mode = jnp.where(restoration.home, ESTIMATE, mode)
-    # Eq. (22): for a step that is not of f-type, and for the point that restoration leaves.
+    # A step that is not of f-type, and the point that restoration leaves, add a corner:
+    # Waechter & Biegler (2006), eq. (22).
     add = (found.accepted & kind.newton & ~found.f_type) | restoration.into
     filter = augmented(found.filter, found.theta, found.phi, add)
     return State(
@@ -100,9 +101,10 @@ def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Moved:
     alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, tau), longest_dual_step(s.zu, dzu, tau))
     w = along(s.w, found.alpha, d)
     low, high = distances(box, w)
+    # Waechter & Biegler (2006), eq. (16).
     keep = lambda z, a, on: jnp.where(
         on, jnp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
-    )  # eq. (16)
+    )
     zl = keep(along(s.zl, alpha_z, dzl), low, box.below)
     zu = keep(along(s.zu, alpha_z, dzu), high, box.above)
     change = jax.tree_util.tree_map(lambda new, old: new - old, found.taken.dual, s.y)
