@@ -23,7 +23,7 @@ from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
 
 # Distance, in designer units, at which a state counts as on its bound. The last barrier mu leaves a
-# distance mu/z: with mu = 1e-10, the default's, less than this where the multiplier z is above 1e-4.
+# distance mu/z: with the default's 1e-10 it is less than this if the multiplier z is above 1e-4.
 _ON_BOUND = 1e-6
 # Factor of sqrt(mu) below which a distance or a multiplier is small. By derivation: the relative
 # error of the barrier's derivative is mu/z^2, a hundredth at this factor.
