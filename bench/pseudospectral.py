@@ -32,7 +32,7 @@ from jaxguide import problems  # noqa: E402
 from jaxguide.host.compilation import quick_compilation  # noqa: E402
 from jaxguide.nominal.direct import interior_point  # noqa: E402
 from jaxguide.nominal.direct.collocation import collocation  # noqa: E402
-from jaxguide.nominal.direct.limits import bounds  # noqa: E402
+from jaxguide.nominal.direct.limits import limits_of  # noqa: E402
 from jaxguide.problem import with_array_leaves  # noqa: E402
 
 TRUTH = 1.525277700649  # r_f of Earth-Mars
@@ -85,7 +85,7 @@ def one_solve(name: str, N: int, tolerance: float, peer: Any, repeats: int) -> d
 
     def run(program: Any, w: Any) -> Any:
         options = interior_point.Options(tolerance, 0.1, 500, 1e-2, False)
-        sol = interior_point.minimise(program, bounds(program), w, options)
+        sol = interior_point.minimise(program, limits_of(program), w, options)
         f, _ = program.objective_and_residual(sol.w)
         return sol.status, sol.iterations, f * program.scale.objective
 

@@ -11,11 +11,14 @@ from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
 from jaxguide import problems
-from jaxguide.nominal.direct import elimination, kkt, newton
+from jaxguide.nominal.direct import newton_system
 from jaxguide.nominal.direct.collocation import FAMILIES, collocation, left_null
+from jaxguide.nominal.direct.elimination import eliminate
 from jaxguide.nominal.direct.guess import edges
+from jaxguide.nominal.direct.kkt_factor import factorise
+from jaxguide.nominal.direct.kkt_step import newton_step
 from jaxguide.nominal.direct.transcription import Transcription
-from jaxguide.nominal.direct.unknowns import Primal, Rows, Scale
+from jaxguide.nominal.direct.unknowns import Equations, Primal, Scale
 from jaxguide.problems import EarthMars
 
 
@@ -62,7 +65,7 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     fractions = jnp.linspace(0.0, 1.0, segments + 1) ** 1.2
     program = Transcription(Everything(), scale, edges(fractions, knots), family, points)
     times = jnp.array([0.0, 1.6, *(0.5,) * len(knots)])
-    size, rng = program.sizes, np.random.default_rng(0)
+    size, rng = program.counts, np.random.default_rng(0)
     r = lambda *shape: jnp.asarray(rng.normal(size=shape)) * 0.1
     random = lambda tree: jax.tree_util.tree_map(lambda a: r(*a.shape), tree)
     w = Primal(
@@ -70,7 +73,7 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
         1 + r(segments, points, 1), times + r(len(times)), jnp.array([1.4]),
         r(segments, points, 2), r(len(ends)),
     )  # fmt: skip
-    y = Rows(
+    y = Equations(
         10 * r(segments, len(program.rule.A), 3), 10 * r(segments, points, 2), 10 * r(len(ends))
     )
     sigma, pull = jax.tree_util.tree_map(lambda a: jnp.abs(a) + 0.3, random(w)), random(w)
@@ -85,15 +88,17 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     def structured():
         nodes, ends = program.derivatives(w)
         _, c = program.objective_and_residual(w)
-        system = newton.System(nodes, ends, *program.hessians(w, y), sigma, given)
-        parts = elimination.eliminate(program, system)
-        factor, ok = kkt.factorise(program, system, parts, delta, jnp.asarray(5.0))
-        objective = newton.gradient(
+        system = newton_system.NewtonSystem(nodes, ends, *program.hessians(w, y), sigma, given)
+        parts = eliminate(program, system)
+        factor, ok = factorise(program, system, parts, delta, jnp.asarray(5.0))
+        objective = newton_system.lagrangian_gradient(
             program, nodes, ends, w, jax.tree_util.tree_map(jnp.zeros_like, y)
         )
         force = jax.tree_util.tree_map(jnp.add, objective, pull)
-        load = newton.Load(force, c._replace(path=c.path + newton.COMPLIANCE * y.path))
-        return kkt.solve(program, system, parts, factor, load), ok
+        load = newton_system.Load(
+            force, c._replace(path=c.path + newton_system.COMPLIANCE * y.path)
+        )
+        return newton_step(program, system, parts, factor, load), ok
 
     flat, unravel = ravel_pytree(w)
     objective = lambda v: program.objective_and_residual(unravel(v))[0]
@@ -111,7 +116,9 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     H, A, g, c = (np.asarray(a) for a in dense())
     slack = np.asarray(ravel_pytree(no._replace(path=~no.path, end=~no.end))[0])
     diagonal = np.asarray(ravel_pytree(sigma)[0]) + np.where(slack, 0, delta)
-    soft = y_back(jnp.zeros_like(y_flat))._replace(path=jnp.full(y.path.shape, newton.COMPLIANCE))
+    soft = y_back(jnp.zeros_like(y_flat))._replace(
+        path=jnp.full(y.path.shape, newton_system.COMPLIANCE)
+    )
     soft = np.asarray(ravel_pytree(soft)[0])
     K = np.block([[H + np.diag(diagonal), A.T], [A, -np.diag(soft)]])
     rhs = -np.concatenate([g + np.asarray(ravel_pytree(pull)[0]), c + soft * np.asarray(y_flat)])

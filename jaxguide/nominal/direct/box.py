@@ -1,37 +1,46 @@
-"""The bounds of a program's unknowns: distances to them, the barrier, and how far a step may go.
+"""The box that bounds the unknowns: distances to it, its barrier, and how far a step may go.
 
-**Source:** A. Waechter & L. T. Biegler, Mathematical Programming 106 (2006), section 3.
+**Source:** Waechter & Biegler, Mathematical Programming 106 (2006).
 """
 
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxguide.nominal.direct.limits import Bounds
+from jaxguide.nominal.direct.limits import Limits
+from jaxguide.nominal.direct.trees import total
 
 _tree = jax.tree_util.tree_map
-Entries: TypeAlias = Any  # one number an unknown: a Primal, or all of them as one vector
+Entries: TypeAlias = Any  # one number for each unknown: a Primal, or all of them as one vector
 
-_KAPPA_D = 1e-5  # damping of one-sided bounds
-_RELAX = 1e-9  # of every bound, so that a state may end on one and the interior is not empty
+# kappa_d, damping of one-sided bounds: Waechter & Biegler (2006), section 3.7 (Ipopt's default).
+_KAPPA_D = 1e-5
+# Room added to every bound, relative to it or to 1, so that a state may end on one and the interior
+# is not empty: Waechter & Biegler (2006), section 3.5. They take 1e-8; a tenth of it is a choice.
+_RELAX = 1e-9
 
 
 class Box(NamedTuple):
-    """Bounds with what follows from them."""
+    """Bounds and what follows from them.
+
+    - `below`, `above`: bool, whether an entry has a lower, an upper bound and may move.
+    - `given`: bool, whether both bounds coincide, so that the entry may not move.
+    """
 
     lo: Entries
     hi: Entries
-    below: Entries  # bool: has a lower bound and may move
+    below: Entries
     above: Entries
     given: Entries
 
 
 @jax.jit
-def boxed(bounds: Bounds) -> Box:
-    """Bounds with a little room; entries whose bounds coincide are given, but for states."""
-    lo, hi = bounds
+def boxed(limits: Limits) -> Box:
+    """The box of `limits`, with a little room. An entry whose bounds coincide is given, unless it
+    is a state: the defects determine those."""
+    lo, hi = limits
     room = lambda b: _RELAX * jnp.maximum(1.0, jnp.abs(b))
     given = _tree(lambda a, b: a >= b, lo, hi)
     given = given._replace(x=jnp.zeros_like(given.x))
@@ -43,7 +52,11 @@ def boxed(bounds: Bounds) -> Box:
 
 
 def inside(box: Box, w: Entries, push: Any) -> Entries:
-    """`w` moved well within its bounds, given entries put where they belong (section 3.6)."""
+    """`w` moved inside its bounds, at least `push` away from them (relative to the bound or to 1,
+    and to the distance of both); given entries at their values.
+
+    **Source:** Waechter & Biegler (2006), section 3.6.
+    """
 
     def one(w: Array, lo: Array, hi: Array, below: Array, above: Array, given: Array) -> Array:
         width = jnp.where(below & above, hi - lo, jnp.inf)
@@ -57,7 +70,7 @@ def inside(box: Box, w: Entries, push: Any) -> Entries:
 
 @jax.jit
 def distances(box: Box, w: Entries) -> tuple[Entries, Entries]:
-    """Distances to the bounds, 1 where there is none."""
+    """Distances of `w` to its lower and upper bounds; 1 where there is no bound."""
     low = _tree(
         lambda w, b, on: jnp.where(on, w - jnp.where(on, b, 0.0), 1.0), w, box.lo, box.below
     )
@@ -67,22 +80,23 @@ def distances(box: Box, w: Entries) -> tuple[Entries, Entries]:
     return low, high
 
 
-def total(tree: Any) -> Array:
-    return sum((jnp.sum(a) for a in jax.tree_util.tree_leaves(tree)), jnp.zeros(()))
-
-
-def complementarity(box: Box, low: Entries, high: Entries, zl: Entries, zu: Entries) -> Array:
-    """Mean of distance times multiplier over all bounds; 0 where there is none."""
+def complementarity(
+    box: Box, low: Entries, high: Entries, zl: Entries, zu: Entries
+) -> Float[Array, ""]:
+    """Mean, over all bounds, of distance times multiplier; 0 if there is no bound."""
     both = _tree(lambda a, b, x, y: a * x + b * y, low, high, zl, zu)
-    count = total(
+    bounds = total(
         _tree(lambda a, b: jnp.where(a, 1.0, 0.0) + jnp.where(b, 1.0, 0.0), box.below, box.above)
     )
-    return total(both) / jnp.maximum(count, 1.0)
+    return total(both) / jnp.maximum(bounds, 1.0)
 
 
 @jax.jit
-def barrier_value(box: Box, w: Entries, mu: Array) -> Array:
-    """-mu sum log of the distances, with the linear damping of one-sided bounds (section 3.7)."""
+def barrier_value(box: Box, w: Entries, mu: Float[Array, ""]) -> Float[Array, ""]:
+    """-mu sum log(distance), with the linear damping of one-sided bounds.
+
+    **Source:** Waechter & Biegler (2006), eq. (3) and section 3.7.
+    """
     low, high = distances(box, w)
     log = lambda a: jnp.log(jnp.where(a > 0, a, jnp.nan))
     logs = total(_tree(lambda a, b: log(a) + log(b), low, high))
@@ -90,8 +104,8 @@ def barrier_value(box: Box, w: Entries, mu: Array) -> Array:
     return mu * (total(_tree(one, low, high, box.below, box.above)) - logs)
 
 
-def barrier_gradient(box: Box, low: Entries, high: Entries, mu: Array) -> Entries:
-    """Gradient of `barrier_value`."""
+def barrier_gradient(box: Box, low: Entries, high: Entries, mu: Float[Array, ""]) -> Entries:
+    """Gradient of `barrier_value`, from the distances."""
 
     def one(a: Array, b: Array, l: Array, h: Array) -> Array:
         lower = jnp.where(l, -1 / a + jnp.where(h, 0.0, _KAPPA_D), 0.0)
@@ -101,8 +115,13 @@ def barrier_gradient(box: Box, low: Entries, high: Entries, mu: Array) -> Entrie
     return _tree(one, low, high, box.below, box.above)
 
 
-def longest_step(gap_low: Entries, gap_high: Entries, dw: Entries, box: Box, tau: Array) -> Array:
-    """The longest step, up to 1, that keeps the fraction 1 - tau of each distance (eq. 15a)."""
+def longest_step(
+    gap_low: Entries, gap_high: Entries, dw: Entries, box: Box, tau: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The longest step, up to 1, that keeps the fraction 1 - tau of each distance.
+
+    **Source:** Waechter & Biegler (2006), eq. (15a).
+    """
 
     def one(a: Array, b: Array, d: Array, l: Array, h: Array) -> Array:
         low = jnp.where(l & (d < 0), -tau * a / jnp.where(d < 0, d, -1.0), jnp.inf)
@@ -113,7 +132,11 @@ def longest_step(gap_low: Entries, gap_high: Entries, dw: Entries, box: Box, tau
     return jnp.min(jnp.stack(steps))
 
 
-def longest_dual_step(z: Entries, dz: Entries, tau: Array) -> Array:
+def longest_dual_step(z: Entries, dz: Entries, tau: Float[Array, ""]) -> Float[Array, ""]:
+    """The longest step, up to 1, that keeps the fraction 1 - tau of each bound's multiplier.
+
+    **Source:** Waechter & Biegler (2006), eq. (15b).
+    """
     one = lambda z, d: jnp.min(
         jnp.where(d < 0, -tau * z / jnp.where(d < 0, d, -1.0), jnp.inf), initial=1.0
     )

@@ -12,12 +12,14 @@ FAMILIES = ("lgl", "cgl", "lgr-left", "lgr-right", "lg")
 
 
 class Collocation(NamedTuple):
-    """One segment on tau in [-1, 1]. State lives at P `support` points, the first of them -1 and
-    the last +1; control and dynamics at C `nodes`, support points first ... first + C - 1.
+    """One segment on tau in [-1, 1]. The state lives at P `support` points, the first of them -1
+    and the last +1; control and dynamics live at C `nodes`, which are the support points
+    first ... first + C - 1. `w` are the quadrature weights of the nodes.
 
-    Defect i of R is `A`[i] X - `B`[i] F, with F = (dt/dtau) f at the nodes: review, problem B^N.
-    Rows `main` determine the states after the first; the others (of LGL and CGL, whose polynomial
-    meets the dynamics at both ends, the one at -1) restrict the control.
+    Defect i of R is `A`[i] X - `B`[i] F, with F = (dt/dtau) f at the nodes: the constraints of
+    problem B^N, review, eq. (21). Rows `main` determine the states after the first point; rows
+    `extra` (of LGL and CGL, whose polynomial meets the dynamics at both ends: the one at -1)
+    restrict the control.
     """
 
     support: np.ndarray
@@ -62,7 +64,7 @@ def collocation(family: str, points: int) -> Collocation:
     A = differentiation(support)[1:]
     if family == "lgr-right":
         return Collocation(support, own.x, 1, own.w, A, np.eye(points), rows, none)
-    # LG: the last state is the first plus the quadrature of the dynamics.
+    # LG: the last state is the first plus the quadrature of the dynamics, review, eq. (15).
     end = np.zeros(points + 2)
     end[0], end[-1] = -1.0, 1.0
     A = np.concatenate([np.pad(A, ((0, 0), (0, 1))), end[None]])
@@ -72,7 +74,7 @@ def collocation(family: str, points: int) -> Collocation:
 
 @ft.cache
 def left_null(family: str, points: int) -> np.ndarray:
-    """v with v^T D = 0, of a grid whose nodes hold both ends: w P_N on LGL. Defect multipliers may
-    carry a multiple of it that the costate equations hardly see."""
+    """The vector v with v^T D = 0, of a grid whose nodes hold both ends (w P_N on LGL). Defect
+    multipliers may carry a multiple of it, which the costate equations hardly see."""
     _, _, right = np.linalg.svd(grid(family, points).differentiation.T)
     return right[-1]

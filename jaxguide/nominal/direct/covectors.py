@@ -1,57 +1,128 @@
 """From the optimiser's solution to an Extremal: the covector mapping, in the user's units.
 
-**Source:** Ross & Karpenko, review (2012), eqs (23)-(25), Proposition 1.
+**Source:** Ross & Karpenko, review (2012), section 4.1: eqs (23)-(24), Proposition 1, Remark 3.
 """
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.conditions.angles import unwrap_angles
-from jaxguide.nominal.direct import interior_point, newton
+from jaxguide.nominal.direct import interior_point
 from jaxguide.nominal.direct.box import Box, boxed, distances
 from jaxguide.nominal.direct.collocation import left_null
-from jaxguide.nominal.direct.limits import Bounds
-from jaxguide.nominal.direct.transcription import Transcription, node_times
+from jaxguide.nominal.direct.limits import Limits
+from jaxguide.nominal.direct.newton_system import lagrangian_gradient
+from jaxguide.nominal.direct.transcription import Nodes, Transcription, node_times
 from jaxguide.nominal.direct.unknowns import flattened
 from jaxguide.problem import Problem, choices, is_free, with_parameters
 from jaxguide.spectral import interpolation_matrix
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
 
+# Distance, in designer units, at which a state counts as on its bound. The last barrier mu leaves a
+# distance mu/z: with the default's 1e-10 it is less than this if the multiplier z is above 1e-4.
+_ON_BOUND = 1e-6
+# Factor of sqrt(mu) below which a distance or a multiplier is small. By derivation: the relative
+# error of the barrier's derivative is mu/z^2, a hundredth at this factor.
+_WEAK = 10
+
 
 def to_extremal(
     problem: Problem,
     program: Transcription,
-    box: Bounds,
+    limits: Limits,
     solution: interior_point.Solution,
 ) -> Extremal:
-    """User units; costates by the covector mapping theorem (eqs 23-25)."""
-    size, rule, scale, w = program.sizes, program.rule, program.scale, solution.w
-    dtype, n = program.dtype, size.n
+    """The solution in user units, with costates by the covector mapping.
+
+    **Source:** Ross & Karpenko, review (2012), eqs (23)-(24) and Proposition 1.
+    """
+    rule, scale, w = program.rule, program.scale, solution.w
     chosen, problem = choices(problem), with_parameters(problem, w.p * scale.p)
-    support = program.support(w)
-    whole = lambda a: jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
-    t_support = node_times(program, w, rule.support)
-    t = jnp.concatenate([t_support[:, :-1].reshape(-1), t_support[-1, -1:]])
-    lam, before, impulse = costates(program, box, solution)
-    nodes, ends = program.derivatives(w)
-    left = newton.gradient(program, nodes, ends, w, solution.y).u
-    net_u = jnp.where(box.lo.u >= box.hi.u, -left, solution.zu.u - solution.zl.u)
-    to_user = scale.objective / scale.x
-    # Controls and multipliers live at the nodes; the ends that are none, extrapolate them.
-    spread = interpolation_matrix(jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.support, dtype))
+    n, m = problem.n, problem.m
+    covectors = costates(program, limits, solution)
+    spread = _spread(program)
+    u = _controls(problem, program, limits, solution, spread)
+    x = whole(program.support(w))[:, :n] * scale.x[None, :n]
+    to_user = (scale.objective / scale.x)[None, :n]
+    f, _ = program.objective_and_residual(w)
+    residual = jnp.maximum(solution.error, solution.violation)
+    return Extremal(
+        t=_times(program, solution),
+        x=x,
+        u=(whole(u) * scale.u[None])[:, :m],
+        reference_nodes=jnp.asarray(rule.support, program.dtype),
+        u_before=(u[:, -1] * scale.u[None])[:, :m],
+        costate=whole(covectors.at_support)[:, :n] * to_user,
+        costate_before=covectors.before[:, :n] * to_user,
+        final_time=w.times[1] * scale.t,
+        objective=f * scale.objective,
+        multipliers=_multipliers(problem, program, limits, solution, covectors.jump, spread),
+        result=_result(problem, program, solution, f, residual),
+        residual=residual,
+        degenerate=_undecided(limits, solution),
+        problem=problem,
+        chosen=chosen,
+    )
+
+
+def whole(a: Float[Array, "segment support *k"]) -> Float[Array, "point *k"]:
+    """Values at the support points as one sequence: a point that two segments share is the first of
+    the later one."""
+    return jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
+
+
+def _times(program: Transcription, solution: interior_point.Solution) -> Float[Array, " point"]:
+    """Times of the support points, in user units."""
+    t = node_times(program, solution.w, program.rule.support)
+    return jnp.concatenate([t[:, :-1].reshape(-1), t[-1, -1:]])
+
+
+def _spread(program: Transcription) -> Float[Array, "support node"]:
+    """From values at the nodes to the support points: ends that are no nodes are extrapolated."""
+    rule, dtype = program.rule, program.dtype
+    return interpolation_matrix(jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.support, dtype))
+
+
+def _controls(
+    problem: Problem,
+    program: Transcription,
+    limits: Limits,
+    solution: interior_point.Solution,
+    spread: Float[Array, "support node"],
+) -> Float[Array, "segment support m"]:
+    """Controls at the support points, scaled, within their bounds; unbounded angles unwrapped, so
+    that they are smooth where they are extrapolated."""
+    counts, rule, scale, w = program.counts, program.rule, program.scale, solution.w
     at_nodes = node_times(program, w, rule.nodes).reshape(-1)
-    x_nodes = support[:, rule.first : rule.first + size.nodes].reshape(-1, n) * scale.x[None]
-    own_u = w.u.reshape(-1, size.m)
+    own = slice(rule.first, rule.first + counts.nodes)
+    x_nodes = program.support(w)[:, own].reshape(-1, counts.n) * scale.x[None]
+    own_u = w.u.reshape(-1, counts.m)
     turned = unwrap_angles(
         problem, at_nodes, x_nodes[:, : problem.n], (own_u * scale.u[None])[:, : problem.m]
     )
     turned = own_u.at[:, : problem.m].set(turned / scale.u[None, : problem.m]).reshape(w.u.shape)
-    u_lo, u_hi = box.lo.u[:, :1], box.hi.u[:, :1]
+    u_lo, u_hi = limits.lo.u[:, :1], limits.hi.u[:, :1]
     turned = jnp.where(jnp.isinf(u_lo) & jnp.isinf(u_hi), turned, w.u)
     u = jnp.einsum("pk,skm->spm", spread, turned)
-    u = jnp.clip(u, u_lo, u_hi)
+    return jnp.clip(u, u_lo, u_hi)
+
+
+def _multipliers(
+    problem: Problem,
+    program: Transcription,
+    limits: Limits,
+    solution: interior_point.Solution,
+    jump: Float[Array, "segment n"],
+    spread: Float[Array, "support node"],
+) -> Multipliers:
+    """Multipliers of all constraints, in user units; those along the trajectory as densities in
+    time, the program's multipliers over weight and dt/dtau, as Proposition 1 has it of costates."""
+    counts, rule, scale, w = program.counts, program.rule, program.scale, solution.w
+    dtype = program.dtype
     spans = program.clocks @ w.times
     rate = (spans[:, 1] - spans[:, 0]) / 2  # dt/dtau, scaled
     clock = rate[:, None, None] * scale.t
@@ -60,91 +131,96 @@ def to_extremal(
     ahead = lambda a: jnp.concatenate([a[0, :1], jnp.concatenate(a[:, 1:])])
     owned = ahead if rule.first else whole
     over_nodes = lambda a: owned(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
+    # A given control has no bounds' multipliers: its own is what the Lagrangian's gradient leaves.
+    nodes, ends = program.derivatives(w)
+    left = lagrangian_gradient(program, nodes, ends, w, solution.y).u
+    net_u = jnp.where(limits.lo.u >= limits.hi.u, -left, solution.zu.u - solution.zl.u)
     # Multipliers of state bounds live at the support points. At a segment's end a part of them may
-    # be an impulse, by which the costate jumps; where that is no node, all.
-    own = slice(rule.first, rule.first + size.nodes)
+    # be an impulse, by which the costate jumps; at an end that is no node, all of them.
     weights = np.full(len(rule.support), np.inf)
-    weights[own] = rule.w
+    weights[rule.first : rule.first + counts.nodes] = rule.w
     net = solution.zu.x - solution.zl.x
-    net = jnp.pad(net.at[:, -1].add(-impulse), ((0, 0), (1, 0), (0, 0)))
+    net = jnp.pad(net.at[:, -1].add(-jump), ((0, 0), (1, 0), (0, 0)))
     state = ahead(net / (jnp.asarray(weights, dtype)[None, :, None] * clock))
     state = state * (scale.objective / scale.x)[None]
-    status = solution.status
+    n, m, r = problem.n, problem.m, counts.n - problem.n
+    q = counts.end - len(program.order) - r
+    nu = solution.y.end * scale.objective / scale.end
+    return Multipliers(
+        nu[:q],
+        over_nodes(solution.y.path) / scale.path[None],
+        state[:, :n],
+        (over_nodes(net_u) / scale.u[None])[:, :m],
+        nu[q : q + r],
+    )
+
+
+def _result(
+    problem: Problem,
+    program: Transcription,
+    solution: interior_point.Solution,
+    f: Float[Array, ""],
+    residual: Float[Array, ""],
+) -> RESULTS:
+    """Why the optimiser ended, or why its numbers are of no use."""
+    status, w = solution.status, solution.w
     result = RESULTS.where(
         status == interior_point.CONVERGED, RESULTS.successful, RESULTS.optimiser_stopped
     )
     result = RESULTS.where(status == interior_point.INFEASIBLE, RESULTS.infeasible, result)
-    finite = jnp.all(jnp.isfinite(support)) & jnp.all(jnp.isfinite(w.u))
+    finite = jnp.all(jnp.isfinite(program.support(w))) & jnp.all(jnp.isfinite(w.u))
     result = RESULTS.where(finite, result, RESULTS.optimiser_stopped)
-    f, _ = program.objective_and_residual(w)
-    residual = jnp.maximum(solution.error, solution.violation)
     lost = jnp.isnan(residual) | ~jnp.isfinite(f)
     result = RESULTS.where(lost, RESULTS.undefined, result)
     if not is_free(problem.final_time):
-        endless = jnp.isinf(jnp.asarray(problem.final_time, dtype))
+        endless = jnp.isinf(jnp.asarray(problem.final_time, program.dtype))
         result = RESULTS.where(endless, RESULTS.hidden_horizon, result)
-    k, m, r = problem.n, problem.m, n - problem.n
-    q = size.end - len(program.order) - r
-    nu = solution.y.end * scale.objective / scale.end
-    return Extremal(
-        t=t,
-        x=whole(support)[:, :k] * scale.x[None, :k],
-        u=(whole(u) * scale.u[None])[:, :m],
-        reference_nodes=jnp.asarray(rule.support, dtype),
-        u_before=(u[:, -1] * scale.u[None])[:, :m],
-        costate=whole(lam)[:, :k] * to_user[None, :k],
-        costate_before=before[:, :k] * to_user[None, :k],
-        final_time=w.times[1] * scale.t,
-        objective=f * scale.objective,
-        multipliers=Multipliers(
-            nu[:q],
-            over_nodes(solution.y.path) / scale.path[None],
-            state[:, :k],
-            (over_nodes(net_u) / scale.u[None])[:, :m],
-            nu[q : q + r],
-        ),
-        result=result,
-        residual=residual,
-        degenerate=_undecided(box, solution),
-        problem=problem,
-        chosen=chosen,
-    )
+    return result
 
 
-def _undecided(bounds: Bounds, solution: interior_point.Solution) -> Bool[Array, ""]:
-    """Whether a bound's distance and multiplier, whose product is the barrier mu, are both small:
-    within a factor of 10 of sqrt(mu), where the barrier's derivative is off by a hundredth."""
-    box = Box(*map(flattened, boxed(bounds)))
-    small = 10 * jnp.sqrt(solution.mu)
+def _undecided(limits: Limits, solution: interior_point.Solution) -> Bool[Array, ""]:
+    """Whether the distance of a bound and its multiplier, whose product is the barrier mu, are both
+    within a factor of `_WEAK` of sqrt(mu): there the barrier's derivative is off by a hundredth or
+    more."""
+    box = Box(*map(flattened, boxed(limits)))
+    small = _WEAK * jnp.sqrt(solution.mu)
     weak = lambda gap, z, on: jnp.any(on & (gap < small) & (z < small))
     w, zl, zu = map(flattened, (solution.w, solution.zl, solution.zu))
     low, high = distances(box, w)
     return weak(low, zl, box.below) | weak(high, zu, box.above)
 
 
-def costates(
-    program: Transcription, box: Bounds, solution: interior_point.Solution
-) -> tuple[Float[Array, "segment support n"], Float[Array, "segment n"], Float[Array, "segment n"]]:
-    """Scaled costates at the support points and just before the end of each segment, and their
-    jumps there.
+class Costates(NamedTuple):
+    """Scaled costates at the support points and just before the end of each segment, and the jump
+    there: the costate before less that after."""
 
-    With the defect multipliers y of the Lagrangian f + y^T (A X - B F), lambda = -B^T y/w at the
-    nodes (Remark 3). At a segment's start the costate is what the segment's Lagrangian gives for
-    its derivative there, the closure condition; LGL and CGL solutions carry besides a multiple of
-    the left null vector of D, fixed per state by both closures.
+    at_support: Float[Array, "segment support n"]
+    before: Float[Array, "segment n"]
+    jump: Float[Array, "segment n"]
+
+
+def costates(program: Transcription, limits: Limits, solution: interior_point.Solution) -> Costates:
+    """Costates lambda_i of problem B^{lambda N} from the defect multipliers y of the Lagrangian
+    f + y^T (A X - B F). The Extremal interpolates between them, review, eq. (23).
+
+    At a segment's start the costate is what the derivative of the Lagrangian with respect to the
+    state there gives (the closure condition). LGL and CGL solutions carry besides a multiple of the
+    left null vector of D, which both closures fix, state by state.
+
+    **Source:** Ross & Karpenko, review (2012), eqs (23)-(24), Proposition 1 and Remark 3.
     """
-    size, rule, w, y = program.sizes, program.rule, solution.w, solution.y
-    dtype, n, C = program.dtype, size.n, size.nodes
-    A, weights = jnp.asarray(rule.A, dtype), jnp.asarray(rule.w, dtype)
+    counts, rule, w, y = program.counts, program.rule, solution.w, solution.y
+    dtype, n = program.dtype, counts.n
+    own = slice(rule.first, rule.first + counts.nodes)
+    weights = jnp.asarray(rule.w, dtype)
+    # Lambda = P Lambda~ with P diagonal, the reciprocals of the integration weights: review,
+    # Proposition 1 and Remark 3. Here Lambda~ is -B^T y.
     f_part = program.node_weights(y)
     nodal = f_part[:, :, :n] / weights[None, :, None]
     nodes, ends = program.derivatives(w)
-    force = jnp.einsum("sko,skoi->ski", f_part, nodes.jacobian)[:, :, :n]
-    on_support = jnp.einsum("rp,srn->spn", A, y.defect)
-    own = slice(rule.first, rule.first + C)
-    on_support = on_support.at[:, own].add(force)
-    start = on_support[:, 0]
-    # At a shared end the next segment takes over, after what state bounds there contribute.
+    start = _closure(program, solution, nodes, f_part)
+    # At a shared end the next segment's costate takes over, after the multipliers of state bounds
+    # there; at the last, lambda_N = dEbar/dx_N: review, eq. (24).
     e = jnp.concatenate([jnp.ones(1, dtype), y.end]) @ ends.jacobian
     net = (solution.zu.x - solution.zl.x)[:, -1]
     after = jnp.concatenate([start[1:], e[-n:][None]])
@@ -153,10 +229,28 @@ def costates(
         v = jnp.asarray(left_null(program.family, program.points), dtype) / weights
         gamma = ((nodal[:, 0] - start) / v[0] + (nodal[:, -1] - before) / v[-1]) / 2
         nodal = nodal - v[None, :, None] * gamma[:, None]
-    if rule.first + C == len(rule.support):
-        # On a bound the costate before is what its own polynomial says; else it is continuous.
-        room = jnp.minimum(w.x[:, -1] - box.lo.x[:, -1], box.hi.x[:, -1] - w.x[:, -1])
-        before = jnp.where(room < 1e-6, nodal[:, -1], after)
-    lam = jnp.zeros((size.segments, size.after + 1, n), dtype)
+    if own.stop == len(rule.support):
+        # On a bound the costate before is that of its own polynomial; elsewhere it is continuous.
+        lo, hi = limits.lo.x[:, -1], limits.hi.x[:, -1]
+        room = jnp.minimum(w.x[:, -1] - lo, hi - w.x[:, -1])
+        before = jnp.where(room < _ON_BOUND, nodal[:, -1], after)
+    lam = jnp.zeros((counts.segments, counts.after + 1, n), dtype)
     lam = lam.at[:, own].set(nodal).at[:, 0].set(start).at[:, -1].set(before)
-    return lam, before, before - after
+    return Costates(lam, before, before - after)
+
+
+def _closure(
+    program: Transcription,
+    solution: interior_point.Solution,
+    nodes: Nodes,
+    f_part: Float[Array, "segment node out"],
+) -> Float[Array, "segment n"]:
+    """Costate at the start of each segment: the derivative of the segment's Lagrangian with respect
+    to the state there, as the closure condition lambda_0 = -dEbar/dx_0 of the review, eq. (24), has
+    it at the first."""
+    rule, y = program.rule, solution.y
+    A = jnp.asarray(rule.A, program.dtype)
+    force = jnp.einsum("sko,skoi->ski", f_part, nodes.jacobian)[:, :, : program.counts.n]
+    on_support = jnp.einsum("rp,srn->spn", A, y.defect)
+    own = slice(rule.first, rule.first + program.counts.nodes)
+    return on_support.at[:, own].add(force)[:, 0]

@@ -1,4 +1,9 @@
-"""States and controls of each segment eliminated by its defects: what is left is a quadratic."""
+"""States and controls of each segment eliminated by its defects: a smaller quadratic is left.
+
+Within a segment the defects leave a null space of the start, the clock, the static parameters and
+as many free directions z as there are controls. It is found by one LU factorisation of the defects'
+transposed Jacobian.
+"""
 
 from typing import Any, NamedTuple
 
@@ -7,25 +12,34 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
-from jaxguide.nominal.direct.newton import COMPLIANCE, System
+from jaxguide.nominal.direct.newton_system import COMPLIANCE, NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 
-_STIFF = 1e16  # of what holds a given control
+# Barrier curvature that stands for a given control. A choice: the square root of it, by which the
+# control's column is divided, is 1e8, so that the control moves by rounding alone.
+_STIFF = 1e16
 
 
 class Segments(NamedTuple):
-    """States and controls after each segment's start, linear in v = (start, z, clock, parameters),
-    where z are the entries that the defects leave free, scaled by `size`."""
+    """States and controls after each segment's start, linear in v = (start, z, clock, parameters).
+    z are the entries that the defects leave free, scaled by `size`.
 
-    basis: Float[Array, "segment row row"]  # L and U of the basic entries
-    order: Int[Array, "segment xu"]  # the basic entries first
-    place: Int[Array, "segment xu"]  # where in that order an entry is
+    - `basis`: L and U of the basic entries, which the defects determine.
+    - `order`: entries of (x, u), the basic ones first; `place`: where in that order an entry is.
+    - `X`, `U`, `T`: states, controls and the nodes' inputs, from v.
+    - `W`: Hessian, springs and barrier of the nodes' inputs.
+    - `H`: the same, and the barrier of the states, as a quadratic of v.
+    """
+
+    basis: Float[Array, "segment row row"]
+    order: Int[Array, "segment xu"]
+    place: Int[Array, "segment xu"]
     size: Float[Array, "segment xu"]
     X: Float[Array, "segment after n v"]
     U: Float[Array, "segment node m v"]
-    T: Float[Array, "segment node in v"]  # the nodes' inputs
-    W: Float[Array, "segment node in in"]  # Hessian, springs and barrier of the nodes' inputs
-    H: Float[Array, "segment v v"]  # the same, and the barrier of the states, of v
+    T: Float[Array, "segment node in v"]
+    W: Float[Array, "segment node in in"]
+    H: Float[Array, "segment v v"]
 
 
 def over_segments(f: Any, items: Any) -> Any:
@@ -36,59 +50,72 @@ def over_segments(f: Any, items: Any) -> Any:
     return jax.lax.map(f, items)
 
 
-def eliminate(program: Transcription, system: System) -> Segments:
-    """The defects' null space, by LU: stable however unstable the dynamics are, where following
-    the states from their start would not be: of states and controls alike, pivoting makes those
-    basic that the defects determine best."""
-    rule, size = program.rule, program.sizes
-    n, m, C, S, dtype = size.n, size.m, size.nodes, size.segments, system.sigma.x.dtype
-    A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
-    rows, support = A.shape
-    diagonal = jnp.einsum("rp,ab->rapb", A, jnp.eye(n, dtype=dtype))
-    own = slice(rule.first, rule.first + C)
-    count = rows * n
+def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
+    """The null space of the defects, and what is left of the quadratic on it.
+
+    The LU is stable however unstable the dynamics are; following the states from their start would
+    not be. Pivoting, over states and controls alike, makes those entries basic that the defects
+    determine best.
+    """
+    rule, counts, dtype = program.rule, program.counts, system.sigma.x.dtype
+    n, m, C, S = counts.n, counts.m, counts.nodes, counts.segments
+    support = len(rule.support)
     # Entries that a barrier holds count for little, so that the reduced Hessian is well scaled.
     flat = lambda x, u: jnp.concatenate([x.reshape(S, -1), u.reshape(S, -1)], axis=1)
     weight = jnp.sqrt(1 + flat(system.sigma.x, _on_controls(system)))
-
-    def one(item: tuple) -> tuple:
-        F, weight = item
-        F = F[:, :n]
-        G = diagonal.at[:, :, own].add(-jnp.einsum("rk,kab->rakb", B, F[:, :, :n]))
-        to_u = -jnp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(count, -1)
-        to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(count, -1)
-        start, G = G[:, :, 0].reshape(count, n), G[:, :, 1:].reshape(count, -1)
-        G = jnp.concatenate([G, to_u], axis=1) / weight[None]
-        lu, order = _lu_with_order(G.T)
-        basis = lu[:count]
-        place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
-        free = -solve_triangular(basis, lu[count:].T, trans=1, lower=True, unit_diagonal=True)
-        follow = -basic(basis, jnp.concatenate([start, to_clock], axis=1))
-        one = jnp.eye(free.shape[1], dtype=dtype)
-        V = jnp.concatenate([
-            jnp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
-            jnp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
-        ])[place]  # fmt: skip
-        return basis, order, place, V / weight[:, None]
-
+    A = jnp.asarray(rule.A, dtype)
+    diagonal = jnp.einsum("rp,ab->rapb", A, jnp.eye(n, dtype=dtype))  # of A X
+    one = lambda item: _null_space(program, diagonal, *item)
     basis, order, place, V = over_segments(one, (system.nodes.jacobian, weight))
+
     nv = V.shape[2]
     split = (support - 1) * n
     X, U = V[:, :split].reshape(S, support - 1, n, nv), V[:, split:].reshape(S, C, m, nv)
     start = jnp.broadcast_to(jnp.eye(n, nv, dtype=dtype), (S, 1, n, nv))
-    x = jnp.concatenate([start, X], axis=1)[:, own]
+    x = jnp.concatenate([start, X], axis=1)[:, rule.first : rule.first + C]
     rest = system.nodes.jacobian.shape[3] - n - m
     clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
     T = jnp.concatenate([x, U, clock], axis=2)
     return Segments(basis, order, place, weight, X, U, T, *_quadratic(program, system, X, U, T))
 
 
+def _null_space(
+    program: Transcription, diagonal: Array, jacobian: Array, weight: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Of one segment: `basis`, `order`, `place` of Segments, and (x, u) from v."""
+    rule, n, m, C = program.rule, program.counts.n, program.counts.m, program.counts.nodes
+    dtype = weight.dtype
+    B = jnp.asarray(rule.B, dtype)
+    own = slice(rule.first, rule.first + C)
+    rows = rule.A.shape[0] * n
+    # The defects' Jacobian by states, controls, clock and parameters: of A X - B F.
+    F = jacobian[:, :n]
+    G = diagonal.at[:, :, own].add(-jnp.einsum("rk,kab->rakb", B, F[:, :, :n]))
+    to_u = -jnp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(rows, -1)
+    to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(rows, -1)
+    start, G = G[:, :, 0].reshape(rows, n), G[:, :, 1:].reshape(rows, -1)
+    G = jnp.concatenate([G, to_u], axis=1) / weight[None]
+
+    lu, order = _lu_with_order(G.T)
+    basis = lu[:rows]
+    place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
+    # Basic entries from the free ones, and from start, clock and parameters.
+    free = -solve_triangular(basis, lu[rows:].T, trans=1, lower=True, unit_diagonal=True)
+    follow = -basic_entries(basis, jnp.concatenate([start, to_clock], axis=1))
+    one = jnp.eye(free.shape[1], dtype=dtype)
+    V = jnp.concatenate([
+        jnp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
+        jnp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
+    ])[place]  # fmt: skip
+    return basis, order, place, V / weight[:, None]
+
+
 def _quadratic(
-    program: Transcription, system: System, X: Array, U: Array, T: Array
+    program: Transcription, system: NewtonSystem, X: Array, U: Array, T: Array
 ) -> tuple[Array, Array]:
     """`W` and `H` of Segments."""
-    rule, n, inputs = program.rule, program.sizes.n, T.shape[2]
-    stiffness, _ = spring(system)
+    rule, n, inputs = program.rule, program.counts.n, T.shape[2]
+    stiffness, _ = path_springs(system)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
     W = system.node_hessian + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
     W = W + on_diagonal(_on_controls(system), n, inputs)
@@ -109,20 +136,26 @@ def _times(W: Array, T: Array) -> Array:
     return jnp.einsum("skab,skbv->skav", W, T)
 
 
-def gram(a: Array, b: Array) -> Float[Array, "segment v v"]:
+def gram(
+    a: Float[Array, "segment point k v"], b: Float[Array, "segment point k v"]
+) -> Float[Array, "segment v v"]:
+    """a^T b of every segment, summed over its points and their entries."""
     flat = lambda a: a.reshape(a.shape[0], -1, a.shape[3])
     return jnp.einsum("siv,siw->svw", flat(a), flat(b))
 
 
-def on_diagonal(diagonal: Float[Array, "segment node k"], first: int, inputs: int) -> Array:
-    """`diagonal` of some of each node's inputs as a matrix of all of them."""
+def on_diagonal(
+    diagonal: Float[Array, "segment node k"], first: int, inputs: int
+) -> Float[Array, "segment node in in"]:
+    """A diagonal matrix for each node, of all its `inputs`: `diagonal` from entry `first` on, zero
+    elsewhere."""
     room = (first, inputs - first - diagonal.shape[2])
     whole = jnp.pad(diagonal, ((0, 0), (0, 0), room))
     return whole[..., None] * jnp.eye(inputs, dtype=diagonal.dtype)[None, None]
 
 
 def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
-    """L and U of the rows of `a` in the `order` that pivoting gives them, in one array.
+    """L and U, in one array, of the rows of `a`, and the `order` of rows that pivoting chose.
 
     The order is read off a further column, which holds the rows' numbers: (L U)_last, rounded. XLA
     finds it from LAPACK's exchanges one by one, which took longer than the factorisation.
@@ -136,19 +169,24 @@ def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " r
     return lu[:, :columns], jnp.clip(order, 0, rows - 1).astype(jnp.int32)
 
 
-def basic(basis: Array, b: Array) -> Array:
-    """The basic entries that make the defects `b`, the others zero."""
+def basic_entries(
+    basis: Float[Array, "row row"], b: Float[Array, "row *k"]
+) -> Float[Array, "row *k"]:
+    """The basic entries that make the defects of one segment `b`, the free ones being zero."""
     y = solve_triangular(basis, b, trans=1)
     return solve_triangular(basis, y, trans=1, lower=True, unit_diagonal=True)
 
 
-def _on_controls(system: System) -> Array:
+def _on_controls(system: NewtonSystem) -> Array:
     """Barrier curvature of the controls; given ones hardly move."""
     return jnp.where(system.given.u, _STIFF, system.sigma.u)
 
 
-def spring(system: System) -> tuple[Array, Array]:
-    """Stiffness of the path rows once their slacks are eliminated, and the slacks' share."""
+def path_springs(
+    system: NewtonSystem,
+) -> tuple[Float[Array, "segment node h"], Float[Array, "segment node h"]]:
+    """Stiffness of the path constraints once their slacks are eliminated, and the share of a force
+    on a slack that reaches the constraint."""
     sigma, fixed = system.sigma.path, system.given.path
     flexible = jnp.where(fixed, 0.0, 1 / jnp.where(sigma > 0, sigma, 1.0))
     stiffness = jnp.where((sigma > 0) | fixed, 1 / (flexible + COMPLIANCE), 0.0)

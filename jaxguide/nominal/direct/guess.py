@@ -1,4 +1,4 @@
-"""Where a direct solve starts: a guess that is straight, random or from an extremal."""
+"""The guess that a direct solve starts from: straight, random or from an extremal."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import bounds_of
+from jaxguide.conditions.units import REST, known_size, natural_units
 from jaxguide.linalg import solve as small_solve
 from jaxguide.nominal.direct.transcription import Transcription
-from jaxguide.nominal.direct.units import REST, known_size, natural_units
 from jaxguide.nominal.direct.unknowns import Primal
 from jaxguide.problem import (
     Problem,
@@ -23,12 +23,19 @@ from jaxguide.problem import (
     with_parameters,
 )
 from jaxguide.trajectory import Extremal
+from jaxguide.transforms.endless import evened
 
-_SHARES = (0.0, -0.25, 0.25)  # of a control's range, from its middle
+# Constant controls that are tried where states rest, from the middle of a control's range and as
+# shares of it: chosen for the brachistochrone, whose start is singular at rest.
+_SHARES = (0.0, -0.25, 0.25)
+# Newton steps towards ends that meet the endpoint constraints, and the ridge that keeps redundant
+# constraints solvable. Choices: a guess need be no better.
+_END_STEPS, _RIDGE = 8, 1e-8
 
 
 def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
-    """Break points as combinations of (t0, tf, knots): each between the two nearest of them."""
+    """Break points, at `fractions` of the horizon, as linear combinations of (t0, tf, knots): each
+    between the two nearest of them. `knots`: which breaks are free."""
     last = fractions.shape[0] - 1
     main = np.array([0, *sorted(knots), last])
     column = np.array([0, *range(2, 2 + len(knots)), 1])
@@ -41,7 +48,7 @@ def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Arr
 
 
 def horizon_guess(problem: Problem) -> tuple[Array, Array]:
-    """Times to start from: given, guessed, or one unit where nothing is said."""
+    """t0 and tf, in user units: given, guessed, or one unit apart where neither is."""
     dtype = jnp.result_type(float)
     number = lambda v: jnp.asarray(v, dtype)
     start, end = problem.initial_time, problem.final_time
@@ -52,7 +59,7 @@ def horizon_guess(problem: Problem) -> tuple[Array, Array]:
         lo, hi = number(end.lo), number(end.hi)
         bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
         tf = jnp.where(bounded, start_value(end), jnp.clip(t0 + 1.0, lo, hi))
-    # What nobody gave makes way.
+    # A time that is not given makes way for one that is.
     halfway = lambda a, b, other: jnp.where(jnp.isfinite(b), (a + b) / 2, other)
     if is_free(end) and end.guess is None:
         tf = jnp.where(tf > t0, tf, halfway(t0, number(end.hi), t0 + 1.0))
@@ -66,15 +73,47 @@ def straight_guess(
 ) -> Primal:
     """States on a straight line to the nearest ends that meet the endpoint constraints; controls
     in the middle of their bounds. In user units."""
-    problem, size = with_parameters(program.problem, None), program.sizes
-    dtype, n = program.dtype, size.n
+    problem, counts = with_parameters(program.problem, None), program.counts
+    dtype, n = program.dtype, counts.n
+    t0, tf = horizon_guess(program.problem)
+    x0, xf = _nearest_ends(program, t0, tf)
+    u = start_control(program.problem, dtype)
+    s = fractions_at(fractions, program.rule.support[1:])
+    x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
+    over = lambda u: jnp.broadcast_to(u, (counts.segments, counts.nodes, counts.m))
+    p = [start_value(v) for v in parameters(program.problem)]
+    times = placed(t0, tf, fractions, knots)
+    straight = without_slacks(program, x0, x, over(u), times, p)
+    u_bounds = bounds_of(problem.control_bounds, counts.m, dtype)
+    unbounded, middle = jnp.isinf(jnp.stack(u_bounds)).any(axis=0), jnp.clip(0.0, *u_bounds)
+    u = jnp.where(unbounded, middle + (u - middle) * _natural_units(program, straight)[1], u)
+    ends_at = lambda xf: problem.endpoint_constraints(x0, xf, t0, tf)
+    constrained = _endpoint_count(program) > 0
+    unasked = ~jnp.any(jax.jacfwd(ends_at)(xf) != 0, axis=0) if constrained else jnp.ones(n, bool)
+    rests = unasked & (jnp.abs(x0) < REST) & (jnp.abs(xf) < REST)
+    rests = rests & ~jnp.asarray(initially_free(program.problem))
+    return propagated(program, straight._replace(u=over(u)), rests)
+
+
+def _endpoint_count(program: Transcription) -> int:
+    """Endpoint constraints of the problem itself, without the order of free times."""
+    return program.counts.end - len(program.order)
+
+
+def _natural_units(program: Transcription, w: Primal) -> tuple[Array, Array]:
+    return natural_units(evened(program.problem), w.times, w.x0, w.x, w.u)
+
+
+def _nearest_ends(program: Transcription, t0: Array, tf: Array) -> tuple[Array, Array]:
+    """Initial and final states near the initial one that meet the endpoint constraints, by Newton's
+    method with least steps, in units of each state's size."""
+    problem, dtype, n = with_parameters(program.problem, None), program.dtype, program.counts.n
     lo, hi = bounds_of(program.problem.state_bounds, n, dtype)
     x0 = jnp.clip(initial_values(program.problem, dtype), lo, hi)
-    t0, tf = horizon_guess(program.problem)
-    q = size.end - len(program.order)
+    q = _endpoint_count(program)
     e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, q, dtype)
-    said = known_size(lo, hi, x0[None])
-    scale = jnp.tile(jnp.where(said > 0, said, 1.0), 2)
+    known = known_size(lo, hi, x0[None])
+    scale = jnp.tile(jnp.where(known > 0, known, 1.0), 2)
     # Free components of the initial state move with the final ones.
     free = jnp.concatenate([jnp.asarray(initially_free(program.problem)), jnp.ones(n, bool)])
     scale = jnp.where(free, scale, 0.0)
@@ -90,38 +129,24 @@ def straight_guess(
         size = jnp.linalg.norm(J, axis=1)
         size = jnp.where(size > 0, size, 1.0)
         miss, J = (e - jnp.clip(e, e_lo, e_hi)) / size, J / size[:, None]
-        step = J.T @ small_solve(J @ J.T + 1e-8 * q * jnp.eye(q, dtype=dtype), miss)
+        step = J.T @ small_solve(J @ J.T + _RIDGE * q * jnp.eye(q, dtype=dtype), miss)
         step = jnp.where(jnp.isfinite(step), step, 0.0)
         return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
 
     ends = jnp.tile(x0, 2)
-    ends = jax.lax.fori_loop(0, 8, nearer, ends) if q else ends
-    x0, xf = ends[:n], ends[n:]
-    u = start_control(program.problem, dtype)
-    s = fractions_at(fractions, program.rule.support[1:])
-    x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
-    over = lambda u: jnp.broadcast_to(u, (size.segments, size.nodes, size.m))
-    p = [start_value(v) for v in parameters(program.problem)]
-    times = placed(t0, tf, fractions, knots)
-    straight = without_slacks(program, x0, x, over(u), times, p)
-    u_bounds = bounds_of(problem.control_bounds, size.m, dtype)
-    unbounded, middle = jnp.isinf(jnp.stack(u_bounds)).any(axis=0), jnp.clip(0.0, *u_bounds)
-    u = jnp.where(unbounded, middle + (u - middle) * natural_units(program.problem, straight)[1], u)
-    ends_at = lambda xf: problem.endpoint_constraints(x0, xf, t0, tf)
-    unasked = ~jnp.any(jax.jacfwd(ends_at)(xf) != 0, axis=0) if q else jnp.ones(n, bool)
-    rests = unasked & (jnp.abs(x0) < REST) & (jnp.abs(xf) < REST)
-    rests = rests & ~jnp.asarray(initially_free(program.problem))
-    return propagated(program, straight._replace(u=over(u)), rests)
+    ends = jax.lax.fori_loop(0, _END_STEPS, nearer, ends) if q else ends
+    return ends[:n], ends[n:]
 
 
 def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> Primal:
-    """`w` with the states that rest at zero, and are asked nothing at the end, flown along it.
+    """`w` with the states `rests`, which start at zero and need meet no end, integrated along it.
 
     Where a start is singular at rest (a brachistochrone's, without speed), the middle control may
-    leave them there: of three constant controls the one that fits the other states' rates best.
+    leave them there. Of three constant controls, that one is taken which fits the other states'
+    rates best.
     """
-    problem, size, dtype = with_parameters(program.problem, None), program.sizes, program.dtype
-    lo, hi = bounds_of(problem.control_bounds, size.m, dtype)
+    problem, counts, dtype = with_parameters(program.problem, None), program.counts, program.dtype
+    lo, hi = bounds_of(problem.control_bounds, counts.m, dtype)
     width = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), hi - lo, 0.0)
     spans = program.clocks @ w.times
     h, middle = (spans[:, 1] - spans[:, 0])[:, None], (spans[:, 0] + spans[:, 1]) / 2
@@ -129,8 +154,8 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     across, halfway = jnp.diff(ends, axis=0), (ends[1:] + ends[:-1]) / 2
     rate = jax.jit(jax.vmap(problem.dynamics))  # traced once
 
-    def flown(share: Array) -> tuple[Array, Array]:
-        """What each segment adds to the states, and how ill that fits the others."""
+    def gains(share: Array) -> tuple[Array, Array]:
+        """The change of the resting states over each segment, and the misfit of the others."""
         u = w.u[:, 0] + share * width[None]
         gained = h * rate(middle, halfway, u)
         gained = jnp.where(rests[None] & jnp.isfinite(gained), gained, 0.0)
@@ -138,14 +163,14 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
         return gained, jnp.sum(jnp.where(rests[None], 0.0, jnp.abs(left)))
 
     shares = jnp.asarray(_SHARES, dtype)
-    tries, misfit = jax.vmap(flown)(shares)
+    tries, misfit = jax.vmap(gains)(shares)
     misfit = jnp.where(jnp.isfinite(misfit), misfit, jnp.inf)
     best = jnp.argmin(misfit * (1 + jnp.abs(shares)))  # the middle if alike
     gained, share = tries[best], jnp.where(jnp.any(rests), shares[best], 0.0)
     along = jnp.asarray((program.rule.support[1:] + 1) / 2, dtype)
     start = jnp.cumsum(gained, axis=0) - gained
     more = start[:, None] + along[None, :, None] * gained[:, None]
-    x_lo, x_hi = bounds_of(problem.state_bounds, size.n, dtype)
+    x_lo, x_hi = bounds_of(problem.state_bounds, counts.n, dtype)
     x = jnp.where(rests[None, None], jnp.clip(w.x + more, x_lo[None, None], x_hi[None, None]), w.x)
     return w._replace(x=x, u=w.u + (share * width)[None, None])
 
@@ -153,23 +178,23 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
 def random_guess(
     program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...], key: Array
 ) -> Primal:
-    """The straight guess, bent at random: states by two sine waves of a third of their size within
-    their bounds, controls on a line between two points of theirs, a free final time within a factor
-    of two. In user units."""
+    """The straight guess, bent at random, in user units: states by two sine waves of a third of
+    their natural unit, within their bounds; controls on a line between two random values; a free
+    final time within a factor of two."""
     w = straight_guess(program, fractions, knots)
-    size, dtype, rule = program.sizes, program.dtype, program.rule
+    counts, dtype, rule = program.counts, program.dtype, program.rule
     k_x, k_u, k_t = jax.random.split(key, 3)
-    lo, hi = bounds_of(program.problem.state_bounds, size.n, dtype)
-    of_x, of_u = natural_units(program.problem, w)
-    waves = jax.random.normal(k_x, (2, size.n), dtype) * of_x[None] / 3
+    lo, hi = bounds_of(program.problem.state_bounds, counts.n, dtype)
+    of_x, of_u = _natural_units(program, w)
+    waves = jax.random.normal(k_x, (2, counts.n), dtype) * of_x[None] / 3
     s = fractions_at(fractions, rule.support[1:])
     bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
     x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])
-    u_lo, u_hi = bounds_of(program.problem.control_bounds, size.m, dtype)
+    u_lo, u_hi = bounds_of(program.problem.control_bounds, counts.m, dtype)
     bounded = jnp.isfinite(u_lo) & jnp.isfinite(u_hi)
     middle = jnp.where(bounded, (u_lo + u_hi) / 2, 0.0)
     half = jnp.where(bounded, (u_hi - u_lo) / 2, 3.0 * of_u)
-    ends = middle[None] + half[None] * jax.random.uniform(k_u, (2, size.m), dtype, -1.0, 1.0)
+    ends = middle[None] + half[None] * jax.random.uniform(k_u, (2, counts.m), dtype, -1.0, 1.0)
     ends = jnp.clip(ends, u_lo[None], u_hi[None])
     s = fractions_at(fractions, rule.nodes)[..., None]
     u = ends[0][None, None] * (1 - s) + ends[1][None, None] * s
@@ -191,15 +216,15 @@ def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Fl
 def without_slacks(
     program: Transcription, x0: Array, x: Array, u: Array, times: Array, p: list
 ) -> Primal:
-    """A guess whose slacks are yet to be filled in."""
-    size, dtype = program.sizes, program.dtype
+    """A guess whose slacks are zero, to be set from the constraints' values."""
+    counts, dtype = program.counts, program.dtype
     p_ = jnp.stack([jnp.asarray(v, dtype) for v in p]) if p else jnp.zeros(0, dtype)
-    path = jnp.zeros((size.segments, size.nodes, size.path), dtype)
-    return Primal(x0, x, u, times, p_, path, jnp.zeros(size.end, dtype))
+    path = jnp.zeros((counts.segments, counts.nodes, counts.path), dtype)
+    return Primal(x0, x, u, times, p_, path, jnp.zeros(counts.end, dtype))
 
 
 def fractions_at(fractions: Float[Array, " edge"], tau: np.ndarray) -> Float[Array, "segment k"]:
-    """Where in the horizon the points `tau` of every segment are."""
+    """The points `tau` of every segment, as fractions of the horizon."""
     local = jnp.asarray((tau[None] + 1) / 2, fractions.dtype)
     return fractions[:-1, None] + jnp.diff(fractions)[:, None] * local
 
@@ -212,15 +237,15 @@ def from_extremal(
     guess: Extremal,
 ) -> Primal:
     """States and controls of `guess` at this mesh's times. In user units."""
-    size, rule, dtype = program.sizes, program.rule, program.dtype
+    counts, rule, dtype = program.counts, program.rule, program.dtype
     t0, tf = guess.t[0], guess.t[-1]
     at = lambda tau: t0 + (tf - t0) * fractions_at(fractions, tau)
     fill = lambda y, k: jnp.concatenate(
         [y, jnp.zeros((*y.shape[:-1], k - y.shape[-1]), dtype)], axis=-1
     )
     point = jax.vmap(jax.vmap(guess.point))
-    x = fill(point(at(rule.support[1:])).x, size.n)
-    u = fill(point(at(rule.nodes)).u, size.m)
+    x = fill(point(at(rule.support[1:])).x, counts.n)
+    u = fill(point(at(rule.nodes)).u, counts.m)
     p = [start_value(v) for v in parameters(guess.problem, like=problem)]
     times = placed(t0, tf, fractions, knots)
-    return without_slacks(program, fill(guess.x[0], size.n), x, u, times, p)
+    return without_slacks(program, fill(guess.x[0], counts.n), x, u, times, p)

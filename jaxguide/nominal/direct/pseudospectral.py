@@ -21,9 +21,9 @@ from jaxguide.nominal.direct.collocation import FAMILIES, collocation
 from jaxguide.nominal.direct.covectors import to_extremal
 from jaxguide.nominal.direct.guess import edges, from_extremal, random_guess, straight_guess
 from jaxguide.nominal.direct.implicit import sensitivity
-from jaxguide.nominal.direct.limits import Bounds, bounds
+from jaxguide.nominal.direct.limits import Limits, limits_of
+from jaxguide.nominal.direct.scaling import designer_units, unit_scale
 from jaxguide.nominal.direct.transcription import Transcription
-from jaxguide.nominal.direct.units import designer_units, unit_scale
 from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.direct.warm import blank_duals, duals, fits
 from jaxguide.nominal.guesses import is_key
@@ -303,12 +303,12 @@ def finished(
     start: interior_point.Start,
     options: interior_point.Options,
 ) -> Extremal:
-    """What the optimiser makes of `Pseudospectral.prepared`: one program for every guess, break
-    and scale."""
+    """The extremal that the optimiser finds from `Pseudospectral.prepared`. One compiled program
+    serves every guess, break and scale."""
     whole = rewrapped(program.problem, problem)
     solution = _solved((whole, program.edges), program, start, options)
     program = _stated(program, (whole, program.edges))
-    return to_extremal(problem, program, bounds(program), solution)
+    return to_extremal(problem, program, limits_of(program), solution)
 
 
 @eqx.filter_jit
@@ -324,16 +324,16 @@ def _scale(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
 @jax.custom_batching.sequential_vmap
 def _one_at_a_time(
     program: Transcription,
-    box: Bounds,
+    limits: Limits,
     start: interior_point.Start,
     options: interior_point.Options,
 ) -> interior_point.Solution:
     """Under `vmap` one problem after another: batched LAPACK may hang on CPU and gains nothing."""
-    return interior_point.minimise(program, box, start, options)
+    return interior_point.minimise(program, limits, start, options)
 
 
 def _stated(program: Transcription, given: tuple[Problem, Array]) -> Transcription:
-    """`program` of another problem, on other breaks."""
+    """`program` for another problem, on other breaks."""
     return eqx.tree_at(lambda p: (p.problem, p.edges), program, given)
 
 
@@ -346,7 +346,7 @@ def _solved(
 ) -> interior_point.Solution:
     """The solution for `given`, a problem and the breaks of the mesh, in the units of `program`."""
     program = _stated(program, given)
-    return _one_at_a_time(program, bounds(program), start, options)
+    return _one_at_a_time(program, limits_of(program), start, options)
 
 
 @_solved.def_jvp

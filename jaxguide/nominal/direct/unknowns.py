@@ -4,31 +4,38 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxguide.problem import Problem, count
 
 
 class Primal(NamedTuple):
-    """The unknowns, scaled. Segments share their ends: `x` holds what follows each one's first."""
+    """The unknowns, scaled. Neighbouring segments share the point between them, so `x` holds, for
+    each segment, the states that follow its first point.
+
+    - `x0`: state at the start of the horizon.
+    - `times`: t0, tf, then the free knots.
+    - `p`: optimised static parameters.
+    - `path`, `end`: slacks, the values that the path and endpoint constraints should equal.
+    """
 
     x0: Float[Array, " n"]
     x: Float[Array, "segment after n"]
     u: Float[Array, "segment node m"]
-    times: Float[Array, " clock"]  # t0, tf, free knots
-    p: Float[Array, " parameter"]  # static parameters
-    path: Float[Array, "segment node h"]  # slacks: what the path constraints should equal
-    end: Float[Array, " q"]  # slacks of the endpoint constraints
+    times: Float[Array, " clock"]
+    p: Float[Array, " parameter"]
+    path: Float[Array, "segment node h"]
+    end: Float[Array, " q"]
 
 
-def flattened(w: Primal) -> Array:
-    """All entries as one vector."""
+def flattened(w: Primal) -> Shaped[Array, " unknown"]:
+    """All entries as one vector; `Transcription.shaped` undoes it."""
     return jnp.concatenate([a.reshape(-1) for a in w])
 
 
-class Rows(NamedTuple):
-    """One number for each equality constraint: its residual c, which vanishes, or its multiplier y
-    in the scaled Lagrangian f + y^T c."""
+class Equations(NamedTuple):
+    """One number for each equality constraint c = 0 of the nonlinear program: its residual c, or
+    its multiplier y in the scaled Lagrangian f + y^T c."""
 
     defect: Float[Array, "segment row n"]
     path: Float[Array, "segment node h"]
@@ -36,7 +43,7 @@ class Rows(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """Designer units: user units = scale times the solver's."""
+    """Designer units: a quantity in user units is its scale times the solver's number."""
 
     x: Float[Array, " n"]
     u: Float[Array, " m"]
@@ -47,7 +54,16 @@ class Scale(NamedTuple):
     objective: Float[Array, ""]
 
 
-class Sizes(NamedTuple):
+class Counts(NamedTuple):
+    """How many of each a transcription has.
+
+    - `n`, `m`: states, controls. `parameters`: optimised static parameters.
+    - `path`, `end`: path constraints at a node; endpoint constraints, the order of free times
+      among them.
+    - `segments`; `nodes`: collocation nodes of a segment; `after`: support points of a segment
+      that follow its first; `times`: t0, tf and free knots.
+    """
+
     n: int
     m: int
     parameters: int
@@ -55,7 +71,7 @@ class Sizes(NamedTuple):
     end: int
     segments: int
     nodes: int
-    after: int  # support points of a segment that follow its first
+    after: int
     times: int
 
 
@@ -67,9 +83,9 @@ class Arcwise(eqx.Module):
     - `smooth`: weights of the squares of the upper half of each control's Legendre coefficients,
       added to the objective: for singular arcs, where nothing else keeps a control from
       oscillating. Where the true control is smooth their share of the objective vanishes.
-    - `released`: states whose bounds are implied by controls held, and would only have multipliers
-      of their own choice; the last point of a segment counts by itself. `unpathed`: likewise path
-      constraints.
+    - `released`: states whose bounds are implied by controls held, so that their multipliers would
+      be arbitrary; for the inner points of a segment, and for its last point.
+    - `unpathed`: likewise path constraints.
     """
 
     held: Float[Array, "segment m"]
@@ -79,7 +95,7 @@ class Arcwise(eqx.Module):
 
     @classmethod
     def blank(cls, segments: int, problem: Problem) -> "Arcwise":
-        """Nothing known."""
+        """Nothing known of any of `segments` arcs of `problem`."""
         zero = jnp.zeros((segments, problem.m), jnp.result_type(float))
         released = jnp.zeros((segments, 2, problem.n), bool)
         return cls(

@@ -1,0 +1,82 @@
+"""Natural units of a problem's states and controls: how large each is likely to be."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxguide.bounds import bounds_of
+from jaxguide.problem import Problem, with_parameters
+
+REST = 1e-8  # a value below it is at rest at zero (a choice: a root of rounding, in any usual unit)
+# Orders of magnitude from 1 at which an unknown's size, estimated from the dynamics, is used. A
+# choice: an estimate is off by a factor of ten or more, and a unit need not be closer than that.
+_FAR = 3
+
+
+def known_size(
+    lo: Float[Array, " n"], hi: Float[Array, " n"], seen: Float[Array, "k n"]
+) -> Float[Array, " n"]:
+    """The larger of two finite bounds; otherwise the largest of the `seen` values, unless it is at
+    rest; otherwise 0."""
+    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
+    wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
+    largest = jnp.max(jnp.abs(seen), axis=0)
+    return jnp.where(wide > 0, wide, jnp.where(largest > REST, largest, 0.0))
+
+
+@jax.jit
+def natural_units(
+    problem: Problem,
+    times: Float[Array, " clock"],
+    x0: Float[Array, " n"],
+    x: Float[Array, "segment after n"],
+    u: Float[Array, "segment node m"],
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """A unit for each state and control, of the order of its values, in user units.
+
+    It is a bound or a value where one is known. Otherwise it is 1, unless the dynamics show that
+    the size is another by orders of magnitude. They give the size of an unknown from those of its
+    neighbours: what moves a state of known size by as much within the horizon, or how far a state
+    is moved by what is known.
+
+    **Arguments:** a guess in user units: `times`, of which the first two are t0 and tf; `x0`, the
+    state at t0; `x`, the states after the first point of each segment, the last at its end; `u`,
+    the controls at each segment's nodes. Of an infinite horizon give the `transforms.evened`
+    problem.
+    """
+    n, m, dtype = problem.n, problem.m, x.dtype
+    seen = jnp.concatenate([x0[None], x.reshape(-1, n)])
+    x_size = known_size(*bounds_of(problem.state_bounds, n, dtype), seen)
+    u_size = known_size(*bounds_of(problem.control_bounds, m, dtype), jnp.zeros((1, m), dtype))
+    known = jnp.concatenate([x_size, u_size])
+    # Small numbers alone are better than nothing.
+    small = jnp.concatenate([jnp.max(jnp.abs(seen), axis=0), jnp.zeros(m, dtype)])
+    known = jnp.where(jnp.any(known > 0), known, small)
+    moves = _moves(problem, times, x0, x, u)
+
+    def spread(_: Any, size: Array) -> Array:
+        mover = jnp.where((size[:n, None] > 0) & (moves > 0), size[:n, None] / moves, jnp.inf)
+        mover = jnp.min(mover, axis=0)
+        moved = jnp.pad(jnp.max(moves * size[None], axis=1), (0, m))
+        estimate = jnp.where(jnp.isfinite(mover), mover, moved)
+        return jnp.where(size > 0, size, estimate)
+
+    estimate = jax.lax.fori_loop(0, n + m, spread, known)
+    far = (estimate > 0) & (jnp.abs(jnp.log10(jnp.where(estimate > 0, estimate, 1.0))) > _FAR)
+    size = jnp.where(known > 0, known, jnp.where(far, estimate, 1.0))
+    return size[:n], size[n:]
+
+
+def _moves(
+    problem: Problem, times: Array, x0: Array, x: Array, u: Array
+) -> Float[Array, "n unknown"]:
+    """By how much a unit of each state and control moves each state within the horizon: the largest
+    slope of the dynamics at the start and at the segments' ends."""
+    rate = jax.jacfwd(with_parameters(problem, None).dynamics, argnums=(1, 2))
+    at = jnp.concatenate(rate(times[0], x0, u[0, 0]), axis=1)[None]
+    ends = jax.vmap(rate, in_axes=(None, 0, 0))((times[0] + times[1]) / 2, x[:, -1], u[:, -1])
+    moves = jnp.concatenate([at, jnp.concatenate(ends, axis=2)])
+    moves = jnp.max(jnp.where(jnp.isfinite(moves), jnp.abs(moves), 0.0), axis=0)
+    return moves * (times[1] - times[0])

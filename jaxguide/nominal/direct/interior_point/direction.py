@@ -1,0 +1,151 @@
+"""The search direction: the Newton system of each kind of step, its inertia corrected.
+
+Three kinds of step share one matrix, so that the factorisation is compiled once:
+
+- Newton's: W of the Lagrangian, Sigma of the barrier; Waechter & Biegler (2006), eq. (11).
+- towards feasibility: W = 0, and sqrt(mu) I in its stead: the least step, weighted by the barrier,
+  that meets the linearised constraints (their section 3.3).
+- an estimate of the multipliers: W + Sigma = I, by least squares (their section 3.6).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxguide.nominal.direct.box import barrier_gradient
+from jaxguide.nominal.direct.elimination import Segments, eliminate
+from jaxguide.nominal.direct.interior_point.evaluation import Iterate
+from jaxguide.nominal.direct.interior_point.state import Setup
+from jaxguide.nominal.direct.kkt_factor import PENALTY, Factor, factorise
+from jaxguide.nominal.direct.kkt_step import newton_step
+from jaxguide.nominal.direct.newton_system import (
+    COMPLIANCE,
+    Load,
+    NewtonSystem,
+    lagrangian_gradient,
+)
+from jaxguide.nominal.direct.trees import choose, largest, zeros_like
+from jaxguide.nominal.direct.unknowns import Equations, Primal, flattened
+
+# Algorithm IC of Waechter & Biegler (2006), section 3.1: delta_w^min, delta_w^0, kappa_w^-,
+# kappa_w^+ and its value before any correction.
+_DELTA_MIN, _DELTA_FIRST, _FALL, _GROW, _GROW_FIRST = 1e-20, 1e-4, 3, 8.0, 100.0
+# Theirs, delta_w^max, is 1e40; with 1e12 the Hessian is already lost in rounding.
+_DELTA_MAX = 1e12
+# Curvature lent to free knots, lest one that nothing needs wander. By experiment, the best of five
+# values tried on such knots.
+_IDLE = 1e-3
+
+
+class Matrix(NamedTuple):
+    """The Newton matrix, factorised. `delta`: what its Hessian was regularised by; `regular`:
+    whether its inertia is right; `needed`: the last positive delta that a Newton step needed."""
+
+    system: NewtonSystem
+    segments: Segments
+    factor: Factor
+    delta: Float[Array, ""]
+    regular: Bool[Array, ""]
+    needed: Float[Array, ""]
+
+
+class Gradients(NamedTuple):
+    """Of the objective, and of the barrier with mu = 1."""
+
+    objective: Float[Array, " unknown"]
+    barrier: Float[Array, " unknown"]
+
+
+class Move(NamedTuple):
+    """A `Step`, its change of the unknowns as one vector: a direction d and the multipliers."""
+
+    primal: Float[Array, " unknown"]
+    dual: Equations
+
+
+def gradients_of(setup: Setup, at: Iterate) -> Gradients:
+    """First derivatives that directions and slopes are made of."""
+    program, w = setup.program, setup.program.shaped(at.state.w)
+    of = lagrangian_gradient(program, at.nodes, at.ends, w, zeros_like(at.state.y))
+    pull = barrier_gradient(setup.box, at.low, at.high, jnp.ones_like(at.state.mu))
+    return Gradients(flattened(of), pull)
+
+
+def factorised(setup: Setup, at: Iterate) -> Matrix:
+    """The matrix of this kind of step, regularised until its inertia is right."""
+    program, s, kind = setup.program, at.state, at.kind
+    w = program.shaped(s.w)
+    hessians = program.hessians(w, s.y)
+    at_nodes, at_ends = choose(kind.flat, zeros_like(hessians), hessians)
+    sigma = _sigma(setup, at)
+    given = program.shaped(setup.box.given)
+    system = NewtonSystem(at.nodes, at.ends, at_nodes, at_ends, sigma, given)
+    segments = eliminate(program, system)
+    rho = PENALTY * (1 + largest((at_nodes, at_ends)))
+    first = jnp.where(kind.estimate, 1.0, jnp.where(kind.restore, jnp.sqrt(s.mu), 0.0))
+    factorise_with = lambda delta: factorise(program, system, segments, delta, rho)
+    delta, factor, regular = _corrected(factorise_with, first, s.delta)
+    needed = jnp.where(regular & ~kind.flat & (delta > 0), delta, s.delta)
+    return Matrix(system, segments, factor, delta, regular, needed)
+
+
+def _sigma(setup: Setup, at: Iterate) -> Primal:
+    """The barrier's curvature z/distance; for an estimate, 1 of the slacks alone (the others have
+    theirs by regularisation)."""
+    program, s = setup.program, at.state
+    w = program.shaped(s.w)
+    on = {name: name in ("path", "end") for name in Primal._fields}
+    slacks = flattened(Primal(*(jnp.full_like(getattr(w, k), on[k]) for k in on)))
+    both = jnp.where(at.kind.estimate, slacks, s.zl / at.low + s.zu / at.high)
+    sigma = program.shaped(both)
+    return sigma._replace(times=sigma.times.at[2:].add(_IDLE))
+
+
+def _corrected(
+    factorise_with: Any, first: Array, last: Array
+) -> tuple[Array, Factor, Bool[Array, ""]]:
+    """Regularisation from `first` up, until the inertia is right: Waechter & Biegler (2006),
+    Algorithm IC. `last`: what was needed before, or 0."""
+
+    def attempt(carry: tuple) -> tuple:
+        delta, _, _ = carry
+        factor, ok = factorise_with(delta)
+        again = jnp.where(last > 0, jnp.maximum(_DELTA_MIN, last / _FALL), _DELTA_FIRST)
+        grow = jnp.where(last > 0, _GROW, _GROW_FIRST)
+        following = jnp.where(delta > first, delta * grow, jnp.maximum(again, _GROW * delta))
+        return jnp.where(ok, delta, following), factor, ok
+
+    blank = jax.eval_shape(lambda d: factorise_with(d)[0], first)
+    blank = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, a.dtype), blank)
+    return jax.lax.while_loop(
+        lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False))
+    )
+
+
+def loaded(setup: Setup, at: Iterate, gradients: Gradients, c: Equations, mu: Array) -> Load:
+    """The right-hand side of this kind of step, negated, for constraints `c` and barrier `mu`."""
+    s, kind = at.state, at.kind
+    bare = gradients.objective - s.zl + s.zu
+    with_barrier = jnp.where(kind.restore, 0.0, gradients.objective) + mu * gradients.barrier
+    force = setup.program.shaped(jnp.where(kind.estimate, bare, with_barrier))
+    # The springs of path constraints start from the multipliers at hand.
+    was = choose(kind.flat, zeros_like(s.y), s.y)
+    return Load(force, c._replace(path=c.path + COMPLIANCE * was.path))
+
+
+def direction(setup: Setup, matrix: Matrix, load: Load) -> Move:
+    """The step for one right-hand side."""
+    step = newton_step(setup.program, matrix.system, matrix.segments, matrix.factor, load)
+    return Move(flattened(step.primal), step.dual)
+
+
+def bound_multiplier_step(setup: Setup, at: Iterate, mu: Array, d: Array) -> tuple[Array, Array]:
+    """Changes of the lower and upper bounds' multipliers with a step `d`.
+
+    **Source:** Waechter & Biegler (2006), eq. (12).
+    """
+    s, box = at.state, setup.box
+    rate = lambda z, a, on, sign: jnp.where(on, mu / a - z - sign * z / a * d, 0.0)
+    return rate(s.zl, at.low, box.below, 1.0), rate(s.zu, at.high, box.above, -1.0)

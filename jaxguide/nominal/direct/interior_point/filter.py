@@ -1,0 +1,56 @@
+"""The filter: pairs of constraint violation theta and barrier function phi that a trial point must
+not be dominated by.
+
+**Source:** Waechter & Biegler (2006), section 2.3.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxguide.nominal.direct.trees import choose
+
+# gamma_theta and gamma_phi, margins of sufficient progress: Waechter & Biegler (2006), eq. (18).
+GAMMA = 1e-5
+# Pairs that the filter holds; the oldest makes way. A choice: the filter empties whenever the
+# barrier changes.
+_SLOTS = 128
+
+
+class Filter(NamedTuple):
+    """Corners (theta, phi) of the region that is forbidden; `used`: how many were ever added."""
+
+    theta: Float[Array, " slot"]
+    phi: Float[Array, " slot"]
+    used: Int[Array, ""]
+
+
+def empty_filter(dtype: Any) -> Filter:
+    """A filter that forbids nothing. (The bound theta_max of Waechter & Biegler (2006), eq. (21),
+    is held apart.)"""
+    slots = jnp.full(_SLOTS, -jnp.inf, dtype)
+    return Filter(slots, slots, jnp.zeros((), jnp.int32))
+
+
+def acceptable(filter: Filter, theta: Float[Array, ""], phi: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether (theta, phi) lies outside the filter: better in one of the two than every corner."""
+    better = (theta < filter.theta) | (phi < filter.phi)
+    live = jnp.arange(_SLOTS, dtype=filter.used.dtype) < filter.used
+    return jnp.all(better | ~live)
+
+
+def augmented(
+    filter: Filter, theta: Float[Array, ""], phi: Float[Array, ""], add: Bool[Array, ""]
+) -> Filter:
+    """The filter with a corner at (theta, phi), less the margins, if `add`.
+
+    **Source:** Waechter & Biegler (2006), eq. (22).
+    """
+    at = filter.used % _SLOTS
+    new = Filter(
+        filter.theta.at[at].set((1 - GAMMA) * theta),
+        filter.phi.at[at].set(phi - GAMMA * theta),
+        filter.used + 1,
+    )
+    return choose(add, new, filter)

@@ -1,0 +1,109 @@
+"""The iterations: one step after another, until the first-order conditions hold or none helps."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxguide.nominal.direct.box import Box, boxed, distances, inside
+from jaxguide.nominal.direct.interior_point.barrier import MEMORY, barrier_of
+from jaxguide.nominal.direct.interior_point.direction import factorised, gradients_of
+from jaxguide.nominal.direct.interior_point.evaluation import Iterate, evaluated
+from jaxguide.nominal.direct.interior_point.filter import empty_filter
+from jaxguide.nominal.direct.interior_point.line_search import searched
+from jaxguide.nominal.direct.interior_point.log import print_iteration
+from jaxguide.nominal.direct.interior_point.state import (
+    CONVERGED,
+    ESTIMATE,
+    INFEASIBLE,
+    NEWTON,
+    RUNNING,
+    Options,
+    Setup,
+    Solution,
+    Start,
+    State,
+)
+from jaxguide.nominal.direct.interior_point.transition import following
+from jaxguide.nominal.direct.limits import Limits
+from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.trees import largest, one_norm
+from jaxguide.nominal.direct.unknowns import flattened
+
+# Violations above which nothing is acceptable, and below which the switching condition counts, of
+# the first one or 1: Waechter & Biegler (2006), eqs (21) and (19).
+_THETA_MAX, _THETA_MIN = 1e4, 1e-4
+
+
+def minimise(program: Transcription, limits: Limits, start: Start, options: Options) -> Solution:
+    """Iterates from `start` to a point that meets the first-order conditions, or says why not.
+
+    Contradictory bounds, and a horizon that cannot be positive, are infeasible at once.
+
+    **Source:** Waechter & Biegler (2006), Algorithm A.
+    """
+    impossible = jnp.any(flattened(limits.lo) > flattened(limits.hi))
+    impossible = impossible | (limits.hi.times[1] <= limits.lo.times[0])
+    setup = Setup(program, Box(*map(flattened, boxed(limits))), options)
+    state = _first_state(setup, start, impossible)
+    end = jax.lax.while_loop(lambda s: s.status == RUNNING, lambda s: _advanced(setup, s), state)
+    w, zl, zu = (program.shaped(a) for a in (end.w, end.zl, end.zu))
+    _, c = program.objective_and_residual(w)
+    return Solution(w, end.y, zl, zu, end.mu, end.status, end.iteration, end.error, largest(c))
+
+
+def _first_state(setup: Setup, start: Start, impossible: Array) -> State:
+    """The start moved inside its bounds, with bounds' multipliers mu/distance or those given;
+    Waechter & Biegler (2006), section 3.6."""
+    (program, box, options), dtype = setup, setup.program.dtype
+    w, net = inside(box, flattened(start.w), options.push), flattened(start.net)
+    mu = jnp.asarray(options.mu, dtype)
+    low, high = distances(box, w)
+    held = lambda a, z, on: jnp.where(on, jnp.maximum(mu / a, z), 0.0)
+    zl, zu = held(low, -net, box.below), held(high, net, box.above)
+    _, c = program.objective_and_residual(program.shaped(w))
+    theta = one_norm(c)
+    zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    return State(
+        w=w,
+        y=start.y,
+        zl=zl,
+        zu=zu,
+        mu=mu,
+        filter=empty_filter(dtype),
+        theta_max=_THETA_MAX * jnp.maximum(1.0, theta),
+        theta_min=_THETA_MIN * jnp.maximum(1.0, theta),
+        theta_entry=theta,
+        delta=zero,
+        mode=jnp.where(options.warm, NEWTON, ESTIMATE).astype(jnp.int32),
+        iteration=none,
+        status=jnp.where(impossible, none + INFEASIBLE, RUNNING),
+        error=zero + jnp.inf,
+        free=jnp.array(False),
+        errors=jnp.full(MEMORY, jnp.inf, dtype),
+    )
+
+
+def _advanced(setup: Setup, s: State) -> State:
+    """The state after one step of any kind; converged, if none is needed any more."""
+    at = evaluated(setup, s)
+    now = at.error_now
+    done = at.kind.newton & (now <= setup.options.tolerance)  # Waechter & Biegler (2006), eq. (6)
+    converged = s._replace(status=s.status * 0 + CONVERGED, iteration=s.iteration + 1, error=now)
+    none = jnp.zeros_like(s.mu)
+    stop, go_on = lambda: (converged, none, none), lambda: _step(setup, at)
+    new, delta, alpha = jax.lax.cond(done, stop, go_on)
+    program = setup.program
+    if program.log:
+        numbers = (s.iteration, at.f, largest(at.c), now, new.mu, delta, alpha)
+        jax.debug.callback(print_iteration, s.mode, program.scale.objective, *numbers)
+    return new
+
+
+def _step(setup: Setup, at: Iterate) -> tuple[State, Array, Array]:
+    """One step: the next state, and the step's regularisation and length."""
+    gradients = gradients_of(setup, at)
+    matrix = factorised(setup, at)
+    barrier = barrier_of(setup, at, matrix.delta)
+    found = searched(setup, at, matrix, gradients, barrier)
+    new = following(setup, at, matrix, barrier, found)
+    return new, matrix.delta, jnp.where(found.accepted, found.alpha, 0.0)

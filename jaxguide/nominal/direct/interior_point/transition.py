@@ -1,0 +1,145 @@
+"""The next state: the new iterate, its bounds' multipliers, and what kind of step comes next."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxguide.nominal.direct.box import barrier_value, distances, longest_dual_step
+from jaxguide.nominal.direct.interior_point.barrier import Barrier
+from jaxguide.nominal.direct.interior_point.direction import Matrix, bound_multiplier_step
+from jaxguide.nominal.direct.interior_point.evaluation import Iterate
+from jaxguide.nominal.direct.interior_point.filter import acceptable, augmented
+from jaxguide.nominal.direct.interior_point.line_search import Found
+from jaxguide.nominal.direct.interior_point.state import (
+    ESTIMATE,
+    INFEASIBLE,
+    NEWTON,
+    RESTORE,
+    RUNNING,
+    STALLED,
+    TOO_MANY,
+    Options,
+    Setup,
+    State,
+)
+from jaxguide.nominal.direct.trees import along, choose, largest, one_norm, zeros_like
+from jaxguide.nominal.direct.unknowns import Equations
+
+# kappa_Sigma, the bounds' multipliers within this factor of mu/distance: Waechter & Biegler (2006),
+# eq. (16).
+_KAPPA_SIGMA = 1e10
+# Largest first estimate of a multiplier: lambda_max of Waechter & Biegler (2006), section 3.6; a
+# larger one is worth less than none.
+_MULTIPLIERS_MAX = 1e3
+# Restoration ends at this share of the violation at which it began: kappa_resto of Waechter &
+# Biegler (2006), section 3.3. It also ends at a violation of a tenth of the tolerance (a choice).
+_KAPPA_RESTO, _FEASIBLE = 0.9, 10
+# A failed step at a violation below the tolerance, but at least this, has stalled; otherwise the
+# problem is infeasible. A choice: a root of rounding.
+_LEAST_VIOLATION = 1e-8
+
+
+class Moved(NamedTuple):
+    """Unknowns and multipliers after a step."""
+
+    w: Float[Array, " unknown"]
+    y: Equations
+    zl: Float[Array, " unknown"]
+    zu: Float[Array, " unknown"]
+
+
+class Restoration(NamedTuple):
+    """What a step means for feasibility restoration: whether it is over (`home`), must begin
+    (`into`), or failed (`stuck`)."""
+
+    home: Bool[Array, ""]
+    into: Bool[Array, ""]
+    stuck: Bool[Array, ""]
+
+
+def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found: Found) -> State:
+    """The state after the step that the line search found."""
+    s, kind, options = at.state, at.kind, setup.options
+    point = _moved(setup, at, barrier, found)
+    restoration = _restoration_after(setup, at, point, found)
+    mode = jnp.where((kind.restore & ~restoration.home) | restoration.into, RESTORE, NEWTON)
+    mode = jnp.where(restoration.home, ESTIMATE, mode)
+    # A step that is not of f-type, and the point that restoration leaves, add a corner:
+    # Waechter & Biegler (2006), eq. (22).
+    add = (found.accepted & kind.newton & ~found.f_type) | restoration.into
+    filter = augmented(found.filter, found.theta, found.phi, add)
+    return State(
+        w=point.w,
+        y=point.y,
+        zl=point.zl,
+        zu=point.zu,
+        mu=found.mu,
+        filter=filter,
+        theta_max=s.theta_max,
+        theta_min=s.theta_min,
+        theta_entry=jnp.where(restoration.into, found.theta, s.theta_entry),
+        delta=matrix.needed,
+        mode=mode.astype(s.mode.dtype),
+        iteration=s.iteration + 1,
+        status=_status(options, at, restoration).astype(s.status.dtype),
+        error=at.error_now,
+        free=barrier.free,
+        errors=barrier.errors,
+    )
+
+
+def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Moved:
+    """The new iterate, if the step was accepted; new multipliers alone, after an estimate.
+
+    **Source:** Waechter & Biegler (2006), eqs (14)-(16); section 3.6 for the estimate.
+    """
+    s, kind, box, mu, d = at.state, at.kind, setup.box, found.mu, found.taken.primal
+    dzl, dzu = bound_multiplier_step(setup, at, mu, d)
+    tau = barrier.tau
+    alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, tau), longest_dual_step(s.zu, dzu, tau))
+    w = along(s.w, found.alpha, d)
+    low, high = distances(box, w)
+    # Waechter & Biegler (2006), eq. (16).
+    keep = lambda z, a, on: jnp.where(
+        on, jnp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
+    )
+    zl = keep(along(s.zl, alpha_z, dzl), low, box.below)
+    zu = keep(along(s.zu, alpha_z, dzu), high, box.above)
+    change = jax.tree_util.tree_map(lambda new, old: new - old, found.taken.dual, s.y)
+    y = along(s.y, found.alpha, change)
+    modest = found.regular & (largest(found.step.dual) <= _MULTIPLIERS_MAX)
+    estimated = choose(modest, found.step.dual, zeros_like(s.y))
+    new_y = choose(kind.estimate, estimated, choose(found.accepted & ~kind.restore, y, s.y))
+    new_zl, new_zu = choose(found.accepted, (zl, zu), (s.zl, s.zu))
+    return Moved(choose(found.accepted, w, s.w), new_y, new_zl, new_zu)
+
+
+def _restoration_after(setup: Setup, at: Iterate, point: Moved, found: Found) -> Restoration:
+    """Whether restoration begins, ends or fails.
+
+    **Source:** Waechter & Biegler (2006), section 3.3.
+    """
+    (program, box, options), s, kind = setup, at.state, at.kind
+    # Asked after restoration alone: otherwise no evaluation is spent.
+    evaluate = lambda: program.objective_and_residual(program.shaped(point.w))
+    f, c = jax.lax.cond(kind.restore, evaluate, lambda: (at.f, at.c))
+    theta, phi = one_norm(c), f + barrier_value(box, point.w, found.mu)
+    less = theta <= _KAPPA_RESTO * s.theta_entry
+    home = (less & acceptable(found.filter, theta, phi)) | (
+        largest(c) <= options.tolerance / _FEASIBLE
+    )
+    failed = ~found.accepted & ~kind.estimate
+    return Restoration(
+        found.accepted & kind.restore & home, failed & kind.newton, failed & kind.restore
+    )
+
+
+def _status(options: Options, at: Iterate, restoration: Restoration) -> Int[Array, ""]:
+    """Whether the iterations go on, or why not."""
+    feasible = largest(at.c) <= jnp.maximum(_LEAST_VIOLATION, options.tolerance)
+    status = jnp.where(restoration.stuck, jnp.where(feasible, STALLED, INFEASIBLE), RUNNING)
+    status = jnp.where(restoration.into & feasible, STALLED, status)
+    last = at.state.iteration + 1 >= options.max_iterations
+    return jnp.where(last & (status == RUNNING), TOO_MANY, status)

@@ -1,0 +1,263 @@
+"""A Newton step of a transcription from its factorised matrix, one right-hand side at a time.
+
+First a particular solution of each segment's defects; then a sweep from the last segment to the
+first for the linear part of the value; the dense system of the global unknowns; a sweep forward for
+the states and controls; last the multipliers of the defects, and the slacks.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float
+
+from jaxguide.nominal.direct.elimination import (
+    Segments,
+    basic_entries,
+    over_segments,
+    path_springs,
+)
+from jaxguide.nominal.direct.kkt_factor import Factor, flexibility, layout
+from jaxguide.nominal.direct.newton_system import COMPLIANCE, Load, NewtonSystem, Step, times_step
+from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.trees import largest, zeros_like
+from jaxguide.nominal.direct.unknowns import Equations, Primal
+
+# Iterative refinement: at most `_REFINEMENTS` after the first solution, until what is left of the
+# forces is `_ENOUGH` of them, some 1e4 roundings, and of the residuals `_ENOUGH_RESIDUAL`: a Newton
+# step that leaves a millionth of the constraints loses nothing. Choices.
+_REFINEMENTS, _ENOUGH, _ENOUGH_RESIDUAL = 2, 1e-12, 1e-6
+_LEAST_RESIDUAL = 1e-15  # rounding: residuals below it are zero
+
+
+class _Particular(NamedTuple):
+    """States, controls and nodes' inputs that meet the defects with v = 0."""
+
+    x: Float[Array, "segment after n"]
+    u: Float[Array, "segment node m"]
+    q: Float[Array, "segment node xu"]
+
+
+class _Sweep(NamedTuple):
+    """Of the backward sweep: the linear part of the value at the start, the z of each segment at
+    theta = 0, negated, and the linear part of the value after each segment."""
+
+    p: Float[Array, " theta"]
+    k: Float[Array, "segment z"]
+    p_after: Float[Array, "segment theta"]
+
+
+class _Globals(NamedTuple):
+    """The solution of the dense system, and the part of it that is static parameters."""
+
+    theta: Float[Array, " theta"]
+    nu: Float[Array, " q"]
+    parameters: Float[Array, " parameter"]
+
+
+class _Forward(NamedTuple):
+    """Changes of states, controls and nodes' inputs, and the multiplier of each segment's end."""
+
+    x: Float[Array, "segment after n"]
+    u: Float[Array, "segment node m"]
+    q: Float[Array, "segment node in"]
+    costate: Float[Array, "segment n"]
+
+
+def newton_step(
+    program: Transcription, system: NewtonSystem, segments: Segments, factor: Factor, load: Load
+) -> Step:
+    """The solution for one right-hand side, refined where it needs to be: stiff barriers lose
+    digits in the reduced Hessian, but not in the product with the matrix."""
+    add = lambda a, b: jax.tree_util.tree_map(jnp.add, a, b)
+    enough_force = _ENOUGH * jnp.maximum(1.0, largest(load.force))
+    enough_residual = _ENOUGH_RESIDUAL * largest(load.residual) + _LEAST_RESIDUAL
+
+    def refine(carry: tuple) -> tuple:
+        count, step, left, _ = carry
+        step = add(step, eliminated_step(program, system, segments, factor, left))
+        left = add(load, times_step(program, system, factor.delta, step))
+        good = (largest(left.force) <= enough_force) & (largest(left.residual) <= enough_residual)
+        return count + 1, step, left, good
+
+    blank = zeros_like(Step(load.force, load.residual))
+    return jax.lax.while_loop(
+        lambda a: ~a[3] & (a[0] <= _REFINEMENTS), refine, (0, blank, load, jnp.array(False))
+    )[1]
+
+
+def eliminated_step(
+    program: Transcription, system: NewtonSystem, segments: Segments, factor: Factor, load: Load
+) -> Step:
+    """The solution for one right-hand side, by elimination alone."""
+    force, residual = load
+    load = load._replace(force=force._replace(u=jnp.where(system.given.u, 0.0, force.u)))
+    stiffness, share = path_springs(system)
+    pushed = stiffness * residual.path + share * force.path
+
+    bar = _particular(program, segments, residual)
+    h = _pull(program, system, segments, factor, load, bar, pushed)
+    sweep = _backward(factor, h, bar)
+    ends = _global_step(program, system, factor, load, sweep)
+    moved = _forward(program, segments, factor, bar, sweep, ends)
+    defect = _defect_multipliers(program, system, segments, factor, load, moved, pushed)
+
+    # Path and endpoint slacks, from their equations.
+    h_dq = jnp.einsum("skha,ska->skh", system.nodes.jacobian[:, :, program.counts.n + 1 :], moved.q)
+    path = stiffness * h_dq + pushed
+    d_path = h_dq + residual.path - COMPLIANCE * path
+    at = layout(program.counts)
+    d_end = system.ends.jacobian[1:] @ ends.theta[: at.xf.stop] + residual.end
+    primal = Primal(
+        ends.theta[at.start],
+        moved.x,
+        jnp.where(system.given.u, 0.0, moved.u),
+        ends.theta[at.times],
+        ends.parameters,
+        jnp.where(system.given.path, 0.0, d_path),
+        jnp.where(system.given.end, 0.0, d_end),
+    )
+    return Step(primal, Equations(defect, path, ends.nu))
+
+
+def _by_segment(a: Array) -> Array:
+    return a.reshape(a.shape[0], -1)
+
+
+def _particular(program: Transcription, segments: Segments, residual: Equations) -> _Particular:
+    """Basic entries that undo the defects, the others zero."""
+    counts, rule = program.counts, program.rule
+    n, m, S, C = counts.n, counts.m, counts.segments, counts.nodes
+
+    def one(item: tuple) -> Array:
+        basis, place, size, c = item
+        moved = jnp.zeros_like(size).at[: len(c)].set(-basic_entries(basis, c))
+        return moved[place] / size
+
+    items = (segments.basis, segments.place, segments.size, _by_segment(residual.defect))
+    both = over_segments(one, items)
+    x = both[:, : counts.after * n].reshape(S, -1, n)
+    u = both[:, counts.after * n :].reshape(S, C, m)
+    at_nodes = jnp.pad(x, ((0, 0), (1, 0), (0, 0)))[:, rule.first : rule.first + C]
+    return _Particular(x, u, jnp.concatenate([at_nodes, u], axis=2))
+
+
+def _pull(
+    program: Transcription,
+    system: NewtonSystem,
+    segments: Segments,
+    factor: Factor,
+    load: Load,
+    bar: _Particular,
+    pushed: Array,
+) -> Float[Array, "segment v"]:
+    """The forces on v that the load and the particular solution leave."""
+    n, m = program.counts.n, program.counts.m
+    force = load.force
+    f = jnp.einsum("skab,skb->ska", factor.W[..., : n + m], bar.q)
+    f = f.at[:, :, n : n + m].add(program.roughness(bar.u))
+    f = f + jnp.einsum("skha,skh->ska", system.nodes.jacobian[:, :, n + 1 :], pushed)
+    on_states = force.x + (system.sigma.x + factor.delta) * bar.x
+    h = jnp.einsum("skav,ska->sv", segments.T, f)
+    h = h + jnp.einsum("sknv,skn->sv", segments.X, on_states)
+    return h + jnp.einsum("skmv,skm->sv", segments.U, force.u)
+
+
+def _backward(factor: Factor, h: Float[Array, "segment v"], bar: _Particular) -> _Sweep:
+    """The linear part of the value, last segment first."""
+    stages = factor.stages
+    n, nu = bar.x.shape[2], stages.factor.shape[1]
+
+    def back(p: Array, item: tuple) -> tuple[Array, tuple]:
+        s, h, x_end = item
+        ahead = p + s.P[:, :n] @ x_end
+        rest = jnp.concatenate([h[:n], h[n + nu :]])
+        h_u = h[n : n + nu] + s.X_u.T @ ahead[:n]
+        h_t = s.L.T @ rest + s.X_t.T @ ahead[:n] + ahead.at[:n].set(0.0)
+        k = cho_solve((s.factor, True), h_u)
+        return h_t - s.N.T @ k, (k, p)
+
+    zero = jnp.zeros(stages.P.shape[1], h.dtype)
+    p, (k, p_after) = jax.lax.scan(back, zero, (stages, h, bar.x[:, -1]), reverse=True)
+    return _Sweep(p, k, p_after)
+
+
+def _global_step(
+    program: Transcription, system: NewtonSystem, factor: Factor, load: Load, sweep: _Sweep
+) -> _Globals:
+    """The global unknowns, by the eigenvectors of their matrix, refined once."""
+    force, residual = load
+    at = layout(program.counts)
+    own_force = jnp.concatenate([force.x0, force.times, force.p])
+    p = sweep.p.at[: at.moving].add(own_force)
+    pulled = jnp.where(system.given.end, 0.0, flexibility(system) * force.end)
+    rhs = -jnp.concatenate([p, residual.end + pulled])
+    rhs = jnp.where(factor.held, 0.0, rhs) / factor.equilibrium
+    invert = lambda r: factor.vectors @ ((factor.vectors.T @ r) / factor.eigenvalues)
+    solution = invert(rhs)
+    solution = (solution + invert(rhs - factor.K @ solution)) / factor.equilibrium
+    theta, nu = solution[: at.theta], solution[at.theta :]
+    return _Globals(theta, nu, theta[at.p])
+
+
+def _forward(
+    program: Transcription,
+    segments: Segments,
+    factor: Factor,
+    bar: _Particular,
+    sweep: _Sweep,
+    ends: _Globals,
+) -> _Forward:
+    """States and controls, first segment first."""
+    n, m, at = program.counts.n, program.counts.m, layout(program.counts)
+
+    def forward(theta: Array, item: tuple) -> tuple[Array, tuple]:
+        s, X, x_end, k, p_after, clock = item
+        z = -(s.KN @ theta + k)
+        v = jnp.concatenate([theta[at.start], z, clock @ theta[at.times], ends.parameters])
+        after = theta.at[at.start].set(X @ v + x_end)
+        return after, (v, s.P[:n] @ after + p_after[:n])
+
+    by_segment = (sweep.k, sweep.p_after, program.clocks)
+    items = (factor.stages, segments.X[:, -1], bar.x[:, -1], *by_segment)
+    _, (v, costate) = jax.lax.scan(forward, ends.theta, items)
+    dx = jnp.einsum("sknv,sv->skn", segments.X, v) + bar.x
+    du = jnp.einsum("skmv,sv->skm", segments.U, v) + bar.u
+    dq = jnp.einsum("skav,sv->ska", segments.T, v).at[:, :, : n + m].add(bar.q)
+    return _Forward(dx, du, dq, costate)
+
+
+def _defect_multipliers(
+    program: Transcription,
+    system: NewtonSystem,
+    segments: Segments,
+    factor: Factor,
+    load: Load,
+    moved: _Forward,
+    pushed: Array,
+) -> Float[Array, "segment row n"]:
+    """Multipliers with which the force on each state after the start, and on each control,
+    vanishes."""
+    counts, rule = program.counts, program.rule
+    n, m, S, C = counts.n, counts.m, counts.segments, counts.nodes
+    own = slice(rule.first, rule.first + C)
+    h_xu = system.nodes.jacobian[:, :, n + 1 :][..., : n + m]
+    f = jnp.einsum("skab,skb->ska", factor.W[:, :, : n + m], moved.q)
+    f = f.at[:, :, n:].add(program.roughness(moved.u))
+    f = f + jnp.einsum("skha,skh->ska", h_xu, pushed)
+    on_states = jnp.zeros((S, counts.after + 1, n), f.dtype).at[:, own].set(f[..., :n])[:, 1:]
+    on_states = on_states + load.force.x + (system.sigma.x + factor.delta) * moved.x
+    # Forces that a next segment's nodes put on a shared end are in its own value.
+    on_states = on_states.at[:, -1].add(moved.costate)
+    on_controls = f[..., n:] + load.force.u
+
+    def one(item: tuple) -> Array:
+        basis, order, size, f = item
+        f = (f / size)[order[: len(basis)]]
+        f = solve_triangular(basis, f, lower=True, unit_diagonal=True)
+        return -solve_triangular(basis, f)
+
+    both = jnp.concatenate([_by_segment(on_states), _by_segment(on_controls)], axis=1)
+    rows = over_segments(one, (segments.basis, segments.order, segments.size, both))
+    return rows.reshape(S, -1, n)
