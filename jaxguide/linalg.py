@@ -42,7 +42,7 @@ def _gauss(a: Array, b: Array) -> Array:
 
 
 @jax.jit
-def solve(a: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+def gauss_solve(a: Float[Array, "n n"], b: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """`a^-1 b` by Gauss-Jordan elimination with partial pivoting.
 
     **Arguments:** `a`: nonsingular; `b`: vector or matrix.
@@ -106,7 +106,7 @@ def left_null_space(
 
 
 class SmallLU(lx.AbstractLinearSolver):
-    """Lineax solver for small square systems by `solve`: batches without LAPACK."""
+    """Lineax solver for small square systems by `gauss_solve`: batches without LAPACK."""
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
         del options

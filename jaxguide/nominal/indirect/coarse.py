@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.conditions.canonical import canonical_rates
-from jaxguide.linalg import solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.indirect.boundary import Unknowns, boundary_residual, horizon
 from jaxguide.nominal.steps import rk4
 from jaxguide.problem import Problem, is_free
@@ -58,7 +58,7 @@ def damped_newton(
         # Accept even a slight rise: Newton often climbs before it falls.
         better = size < 2.0 * best
         v = jnp.where(better, trial, v)
-        dv = jnp.where(better, -solve(jacobian, r), dv)
+        dv = jnp.where(better, -gauss_solve(jacobian, r), dv)
         step = jnp.where(better, 1.0, 0.3 * step)
         best = jnp.where(better, size, best)
         return v, dv, step, best, jnp.where(better, trial_cost, cost), k + 1

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxguide.bounds import bounds_of
-from jaxguide.linalg import solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.indirect.boundary import Unknowns
 from jaxguide.nominal.steps import rk4
 from jaxguide.problem import (
@@ -95,7 +95,7 @@ def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any
     a, b = rows[:, 1:], rows[:, 0]
     normal = a.T @ a
     ridge = 1e-8 * (jnp.trace(normal) / max(q, 1) + 1e-30)
-    nu = -solve(normal + ridge * jnp.eye(q, dtype=dtype), a.T @ b)
+    nu = -gauss_solve(normal + ridge * jnp.eye(q, dtype=dtype), a.T @ b)
     costate = lams[:, :, 0] + lams[:, :, 1:] @ nu
     starts = jnp.concatenate([xs, costate], axis=1)[:total:steps]
     none = jnp.zeros((0,), dtype)
