@@ -12,11 +12,12 @@ from jax.flatten_util import ravel_pytree
 import jaxguide as jg
 from jaxguide import problems
 from jaxguide.nominal.direct import elimination, kkt, newton
-from jaxguide.nominal.direct.collocation import FAMILIES, collocation, left_null
+from jaxguide.nominal.direct.collocation import collocation, left_null
 from jaxguide.nominal.direct.guess import edges
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal, Rows, Scale
 from jaxguide.problems import EarthMars
+from jaxguide.spectral import FAMILIES
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -1,20 +1,12 @@
 """Standard grids with their matrices: host-side NumPy constants, cached, for use under `jit`."""
 
 import functools as ft
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxguide.spectral.nodes import Nodes, nodes_cgl, nodes_lg, nodes_lgl, nodes_lgr
-
-FAMILIES: dict[str, Callable[[int], Nodes]] = {
-    "lg": nodes_lg,
-    "lgl": nodes_lgl,
-    "cgl": nodes_cgl,
-    "lgr-left": lambda n: nodes_lgr(n, "left"),
-    "lgr-right": lambda n: nodes_lgr(n, "right"),
-}
+from jaxguide.spectral.families import NodeFamily, checked_nodes, node_family
+from jaxguide.spectral.nodes import nodes_lg
 
 
 class Grid(NamedTuple):
@@ -32,25 +24,25 @@ class Grid(NamedTuple):
 
 
 @ft.cache
-def grid(family: str, n: int) -> Grid:
+def grid(family: str | NodeFamily, n: int) -> Grid:
     """Nodes, weights and matrices of `n` points.
 
     Written in NumPy beside the JAX versions (tests hold them equal) so that the constants are
     float64 whatever JAX is set to, and are no part of the compiled program.
 
-    **Arguments:** `family`: "lg", "lgl", "cgl", "lgr-left" or "lgr-right"; `n`: number of points.
+    **Arguments:** `family`: "lg", "lgl", "cgl", "lgr-left", "lgr-right" or a `NodeFamily`; `n`:
+    number of points.
 
     **Returns:** a `Grid`; cast it to the dtype in use.
 
     **Error:** as `differentiation_matrix` and `integration_matrix`.
 
-    **Raises:** `ValueError` for another family or too few points.
+    **Raises:** `ValueError` for another family, too few points, or nodes that break the contract
+    of `NodeFamily`.
 
     **Source:** as the functions named.
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}.")
-    x, w = FAMILIES[family](n)
+    x, w = checked_nodes(node_family(family), n)
     weights = capacity_weights(x)
     d = differentiation(x, weights)
 
