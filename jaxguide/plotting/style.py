@@ -99,7 +99,7 @@ def label(name: str, units: Units, prefix: str = "") -> str:
     return f"{symbol(name, prefix)} [{unit}]" if unit else symbol(name, prefix)
 
 
-def grid(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, np.ndarray]:
+def panel_grid(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, np.ndarray]:
     figure = Figure(figsize=(WIDTH if columns > 1 else 0.72 * WIDTH, height * rows))
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 

@@ -11,10 +11,10 @@ from jaxguide.plotting.style import (
     MARKERS,
     Units,
     costate_symbol,
-    grid,
     label,
     line,
     names_of,
+    panel_grid,
     styled,
     symbol,
     time_axis,
@@ -37,7 +37,7 @@ def plot_extremal(extremal: Any, units: Units = None) -> Figure:
         ("state", fine[:, :n], states, ""),
         ("costate", fine[:, -n:], states, r"\lambda"),
     )
-    figure, axes = grid(3, 1, 2.1, sharex=True)
+    figure, axes = panel_grid(3, 1, 2.1, sharex=True)
     for axis, (what, values, names, prefix) in zip(axes[:, 0], panels, strict=True):
         for i, name in enumerate(names):
             text = symbol(name) if not prefix else costate_symbol(name)
@@ -56,7 +56,7 @@ def plot_gains(schedule: Any, units: Units = None) -> Figure:
     """Gains against time on a symmetric logarithmic scale, and their error estimate below."""
     states, controls = names_of(schedule.extremal.problem)
     t, K = np.asarray(schedule.times), np.asarray(schedule.K)
-    figure, axes = grid(len(controls) + 1, 1, 2.3, sharex=True)
+    figure, axes = panel_grid(len(controls) + 1, 1, 2.3, sharex=True)
     for i, control in enumerate(controls):
         axis = axes[i, 0]
         for j, state in enumerate(states):
@@ -87,7 +87,7 @@ def plot_flight(flight: Any, extremal: Any, units: Units = None) -> Figure:
     t, x = np.asarray(flight.t), np.asarray(flight.x)
     x_nominal, u_nominal = at(extremal, t)
     u, du = np.asarray(flight.u), np.asarray(flight.commands)
-    figure, axes = grid(len(states) + len(controls), 2, 1.45, sharex=True)
+    figure, axes = panel_grid(len(states) + len(controls), 2, 1.45, sharex=True)
     rows = [(name, x[:, i], x_nominal[:, i], None) for i, name in enumerate(states)]
     rows += [(name, u[:, i], u_nominal[:, i], du[:, i]) for i, name in enumerate(controls)]
     for (left, right), (name, flown, nominal, deviation) in zip(axes, rows, strict=True):
@@ -174,7 +174,7 @@ def _cases(
     """A panel for each (times, values by case, text), all with the same cases."""
     cases = len(panels[0][1])
     labels = [f"case {k + 1}" for k in range(cases)] if labels is None else labels
-    figure, axes = grid(len(panels), 1, 3.4 if len(panels) == 1 else 2.2, sharex=True)
+    figure, axes = panel_grid(len(panels), 1, 3.4 if len(panels) == 1 else 2.2, sharex=True)
     for axis, (t, values, text) in zip(axes[:, 0], panels, strict=True):
         axis.axhline(0.0, color="#808080", linewidth=0.6)
         for k, (row, text_k) in enumerate(zip(values, labels, strict=True)):
@@ -199,7 +199,7 @@ def plot_gain_errors(
 
     **Arguments:** `errors`: panel title -> method -> (points, errors).
     """
-    figure, axes = grid(1, len(errors), 3.0, sharey=True)
+    figure, axes = panel_grid(1, len(errors), 3.0, sharey=True)
     for axis, (title, methods) in zip(axes[0], errors.items(), strict=True):
         for k, (method, (points, values)) in enumerate(methods.items()):
             values = np.maximum(np.asarray(values, float), 1e-17)

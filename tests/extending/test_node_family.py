@@ -31,11 +31,9 @@ class DoubleIntegrator(jg.Problem):
 
 def documented() -> jg.NodeFamily:
     """An object of the class that the docstring of `jg.NodeFamily` shows: Fejer's first rule."""
-    text = textwrap.dedent(
-        (jg.NodeFamily.__doc__ or "").split("first rule:")[1].split("jg.solve(")[0]
-    )
+    shown = (jg.NodeFamily.__doc__ or "").split("first rule:")[1].split("jg.solve(")[0]
     names: dict[str, Any] = {"jg": jg, "np": np}
-    exec(text, names)
+    exec(textwrap.dedent(shown), names)
     return names["Fejer"]()
 
 

@@ -50,11 +50,11 @@ def design(steps: int = 80, nominal: Extremal | None = None) -> Ready:
     the nodes, its second derivatives and gains, the search for the reference time, and the flights.
     """
     nominal = solve(LunarLaunch(), PiecewiseLinear(NODES)) if nominal is None else nominal
-    make = functools.partial(build, nominal)
+    make = functools.partial(_build, nominal)
     return Ready(
         name="lunar-launch",
         about="nodes of the control, and the gain stations worth storing",
-        objective=objective,
+        objective=_objective,
         # Each inner station is there by 0.88 at first.
         design={
             "nodes": Ascending(np.linspace(0.0, 1.0, NODES)),
@@ -71,7 +71,7 @@ def design(steps: int = 80, nominal: Extremal | None = None) -> Ready:
     )
 
 
-def build(
+def _build(
     nominal: Extremal, own: dict[str, Any], temperature: Any
 ) -> tuple[Mission, Float[Array, " g"]]:
     """The mission, and how far each station is there."""
@@ -93,7 +93,7 @@ def squared_miss(flying: Mission, flight: Flight) -> Float[Array, ""]:
     return jnp.sum(jnp.asarray(WEIGHTS, off.dtype) * off**2)
 
 
-def objective(built: tuple[Mission, Array], keys: Array) -> tuple[Array, dict[str, Array]]:
+def _objective(built: tuple[Mission, Array], keys: Array) -> tuple[Array, dict[str, Array]]:
     flying, present = built
     error = jnp.mean(Flown(dispersions(), squared_miss, chunk=20)(flying, keys))
     stations = jnp.sum(present)
@@ -110,7 +110,7 @@ def subsets(make: Any, own: dict[str, Any], keys: Array) -> dict[tuple[int, ...]
     """The true objective of every way to leave inner stations out, the nodes as they are."""
     # A logit of 40 at temperature 1 is a one or a zero, to rounding.
     true = jax.jit(
-        lambda nodes, there: objective(
+        lambda nodes, there: _objective(
             make({"nodes": nodes, "present": there}, jnp.ones(())), keys
         )[0],
         compiler_options=quick_compilation(),  # pyright: ignore[reportArgumentType]

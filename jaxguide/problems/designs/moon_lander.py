@@ -41,7 +41,7 @@ def design(segments: int = 4, steps: int = 200) -> Ready:
         about=f"breaks of a mesh of {segments} segments, for a control that switches",
         objective=objective,
         design={"breaks": Ascending(np.linspace(0.0, 1.0, segments + 1))},
-        build=build,
+        build=_build,
         optimizer=optax.adam(optax.cosine_decay_schedule(0.1, steps)),
         steps=steps,
         cases=1,
@@ -51,7 +51,7 @@ def design(segments: int = 4, steps: int = 200) -> Ready:
     )
 
 
-def build(own: dict[str, Any]) -> Extremal:
+def _build(own: dict[str, Any]) -> Extremal:
     method = dataclasses.replace(METHOD, fractions=own["breaks"])
     return solve(MoonLander(), method, throw=False)
 
@@ -73,7 +73,7 @@ def _confirm(tuned: Tuned, cases: int, seed: int) -> Confirmed:
     best = MoonLander.reference.value
     columns = []
     for own in (tuned.start, tuned.design):
-        extremal = build(jax.tree_util.tree_map(jnp.asarray, own))
+        extremal = _build(jax.tree_util.tree_map(jnp.asarray, own))
         nearest = float(np.min(np.abs(np.asarray(extremal.breaks) - at)))
         off = abs(float(extremal.objective) / best - 1)
         columns.append((float(mesh_error(extremal)), off, nearest))

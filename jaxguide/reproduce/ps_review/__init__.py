@@ -13,8 +13,8 @@ from jaxguide.reproduce.stages import Stages
 
 
 def run(out: Path | None = None, progress: Progress | None = None) -> Report:
-    """Every claim of the two sections that has a number in it, and figures 4, 5, 7, 8 and 9 in the
-    folder `out` if there is one."""
+    """Every claim of the two sections that has a number in it; figures 4, 5, 7, 8, 9 and two more
+    go to the folder `out`, if given."""
     report = Report("Pseudospectral optimal control: a review (Ross & Karpenko 2012)")
     meter = NoProgress() if progress is None else progress
     stages = Stages(report, meter, len(sections.ALL) + (out is not None))

@@ -1,4 +1,4 @@
-"""The report's sections: each computes, and judges against its reference or what theory says."""
+"""The report's sections: each computes, and judges against its reference or against theory."""
 
 import numpy as np
 
@@ -30,6 +30,7 @@ NAMES = {"lgl": "LGL", "lgr-left": "LGR", "lgr-right": "LGR (+1)", "lg": "LG", "
 
 
 def interpolants(report: Report) -> None:
+    """Review, eqs. (10)-(16), figures 4 and 5."""
     section = report.section(
         "Weighted interpolants (eqs 10-16; figures 4 and 5)",
         "By the library's matrices, on 8 arbitrary points (the paper prints none, nor its W; here "
@@ -66,6 +67,7 @@ def interpolants(report: Report) -> None:
 
 
 def uniform_grids(report: Report) -> None:
+    """Review, problem E1, figures 7 and 8."""
     section = report.section(
         "E1 on uniform grids (figures 7 and 8)",
         "A linear program, solved as it stands by HiGHS (scipy) and in closed form: minimise w.u "
@@ -77,7 +79,7 @@ def uniform_grids(report: Report) -> None:
         "9 points have negative weights and 10 have none.",
     )
     for points in range(8, 17):
-        found = uniform.solve(points)
+        found = uniform.solve_e1(points)
         printed = {} if points != POSITIVE_POINTS else {"printed": 0}
         reference = LEAST_WEIGHT.get(points)
         digits = {} if reference is None else {"tolerance": 5e-4 if points == 12 else 5e-5}
@@ -119,6 +121,7 @@ CASES = (  # family, ends extrapolated, weight
 
 
 def gaussian_grids(report: Report) -> None:
+    """Review, problem E2, figure 9."""
     section = report.section(
         "E2 on Gaussian grids of 10 points (figure 9)",
         "One quadratic program each, by a primal-dual active-set method whose last step is a dense "
@@ -131,7 +134,7 @@ def gaussian_grids(report: Report) -> None:
         "x_1 then vanish at the end, and no point within the bounds is left.",
     )
     for family, extrapolated, weight in CASES:
-        found = gaussian.solve(family, 10, extrapolated, weight)
+        found = gaussian.solve_e2(family, 10, extrapolated, weight)
         how = "extrapolated" if extrapolated else "first and last node"
         name = f"{NAMES[family]}, ends: {how}, W = {weight}"
         reference = CONTROL_ERRORS.get((family, extrapolated))
@@ -151,6 +154,7 @@ def gaussian_grids(report: Report) -> None:
 
 
 def table_1(report: Report) -> None:
+    """Review, Table 1."""
     section = report.section(
         "Table 1: which weight, which grid, which ends",
         "W = 1 for the state throughout; W* of the costate decides. Discrete integration by parts, "
@@ -194,6 +198,7 @@ def table_1(report: Report) -> None:
 
 
 def covector_mapping(report: Report) -> None:
+    """Review, figure 6, eqs. (23)-(25), Proposition 1, Remark 3."""
     section = report.section(
         "The covector mapping diagram (figure 6; eqs 23-25; Proposition 1)",
         "x1' = x2, x2' = -t x1 + u, tracking what makes x1 = sin(3t + 0.4) optimal; errors of both "
@@ -266,6 +271,7 @@ def _proposition_1(report: Report) -> None:
 
 
 def infinite_horizon(report: Report) -> None:
+    """Review, eq. (6), and W = 1 - t of Table 1."""
     section = report.section(
         "An infinite horizon: LGR, W = 1 - t, bilinear map (eq. 6)",
         "x' = x + u, cost x^2 + u^2, x(0) = 1: J = 1 + sqrt 2 = 2.41421356... Here W = 1 does as "
@@ -273,8 +279,8 @@ def infinite_horizon(report: Report) -> None:
         "orders of magnitude: judged to half a decade, and what is below 1e-14 counts as 1e-14.",
     )
     for points, reference in INFINITE.items():
-        error = infinite.cost(points) - infinite.VALUE
-        plain = infinite.cost(points, "1") - infinite.VALUE
+        error = infinite.regulator_cost(points) - infinite.VALUE
+        plain = infinite.regulator_cost(points, "1") - infinite.VALUE
         section.add(
             f"{points} points: log10 of the error of J", np.log10(max(abs(error), 1e-14)),
             np.log10(reference), tolerance=0.5, note=f"{error:.2e}; with W = 1: {plain:.2e}",
@@ -282,6 +288,7 @@ def infinite_horizon(report: Report) -> None:
 
 
 def convergence(report: Report) -> None:
+    """Review, section 4.3: Theorem 2, and Kang's rate of the cost."""
     section = report.section(
         "Rates: Theorem 2, and Kang's for the cost (section 4.3)",
         "x' = u on LGL, 8 to 128 points. x = sin 2t + sgn(t-c) (t-c)^m is in W^{m,inf}. Slopes of "
