@@ -10,10 +10,12 @@ from jaxguide.spectral.nodes import nodes_lg
 
 
 class Grid(NamedTuple):
-    """A family's constants, read-only float64, tau on [-1, 1] dimensionless.
+    """Constants of n nodes of a family, read-only float64; tau on [-1, 1], dimensionless.
 
-    `differentiation` and `integration` (from -1) are the matrices of `matrices.py`; `ends` (2, n)
-    evaluates the interpolant at -1 and +1.
+    - `x`, `w` (n,): nodes and quadrature weights.
+    - `differentiation`, `integration` (n, n): as `differentiation_matrix` and `integration_matrix`
+      from -1.
+    - `ends` (2, n): evaluates the interpolant at -1 and +1.
     """
 
     x: np.ndarray
@@ -35,12 +37,12 @@ def grid(family: str | NodeFamily, n: int) -> Grid:
 
     **Returns:** a `Grid`; cast it to the dtype in use.
 
-    **Error:** as `differentiation_matrix` and `integration_matrix`.
+    **Error:** that of `differentiation_matrix` and `integration_matrix`.
 
     **Raises:** `ValueError` for another family, too few points, or nodes that break the contract
     of `NodeFamily`.
 
-    **Source:** as the functions named.
+    **Source:** that of `differentiation_matrix` and `integration_matrix`.
     """
     x, w = checked_nodes(node_family(family), n)
     weights = capacity_weights(x)
@@ -59,13 +61,23 @@ def grid(family: str | NodeFamily, n: int) -> Grid:
 
 
 def capacity_weights(x: np.ndarray) -> np.ndarray:
-    """Barycentric weights: 2 is the inverse capacity of [-1, 1]; in this order of factors float64
-    holds past n = 512."""
+    """Barycentric weights (n,) of distinct nodes on [-1, 1], in NumPy.
+
+    Factors are scaled by 2, the inverse capacity of [-1, 1]; in this order their products stay
+    within float64 past n = 512.
+
+    **Source:** Berrut & Trefethen, SIAM Review 46 (2004), eq. (3.2) and section 7.
+    """
     return 1 / np.prod((x[:, None] - x[None, :] + np.eye(len(x)) / 2) * 2, axis=1)
 
 
 def differentiation(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The differentiation matrix of any distinct nodes, in NumPy."""
+    """The differentiation matrix (n, n) of distinct nodes `x`, in NumPy.
+
+    **Arguments:** `weights`: barycentric weights of `x`, if at hand.
+
+    **Error, Source:** that of `differentiation_matrix`.
+    """
     weights = capacity_weights(x) if weights is None else weights
     eye = np.eye(len(x))
     d = (weights[None, :] / weights[:, None] - eye) / (x[:, None] - x[None, :] + eye)
@@ -73,7 +85,12 @@ def differentiation(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
 
 
 def evaluation(x: np.ndarray, query: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Matrix of the interpolant through any distinct nodes `x`, at `query`, in NumPy."""
+    """Matrix (q, n) that evaluates the interpolant through distinct nodes `x` at `query`, in NumPy.
+
+    **Arguments:** `weights`: barycentric weights of `x`, if at hand.
+
+    **Error, Source:** that of `interpolation_matrix`.
+    """
     weights = capacity_weights(x) if weights is None else weights
     dx = query[:, None] - x[None, :]
     hit = dx == 0
