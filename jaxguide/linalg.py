@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
-# Up to this size elimination is unrolled, so that XLA fuses it: by experiment on the 2n x 2n matrices
-# of guidance, run time against the time to compile.
+# Up to this size elimination is unrolled, so that XLA fuses it: by experiment on the 2n x 2n
+# matrices of guidance, run time against the time to compile.
 _UNROLL = 8
 
 

@@ -83,8 +83,8 @@ def line(i: int) -> dict[str, Any]:
 
 
 def symbol(name: str, prefix: str = "") -> str:
-    """A name as TeX for Matplotlib: v_r as v with a subscript, Greek letters as symbols, other words
-    as they are. `prefix`: TeX to stand before it, such as a delta."""
+    """A name as TeX for Matplotlib: v_r as v with a subscript, Greek letters as symbols, other
+    words as they are. `prefix`: TeX to stand before it, such as a delta."""
     head, _, tail = name.partition("_")
     short = re.fullmatch(r"[A-Za-z]", head) or head in _GREEK
     if not short or (tail and not re.fullmatch(r"[A-Za-z0-9]{1,3}", tail)):

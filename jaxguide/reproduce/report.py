@@ -26,7 +26,7 @@ class Row:
 
     **Arguments:**
 
-    - `name`: what it is.
+    - `name`: of the number.
     - `computed`: the value found here.
     - `reference`: an independent value held to be true.
     - `printed`: the value in the publication.
@@ -162,7 +162,7 @@ class Report:
         return len(judged) > 0 and all(row.passed for row in judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: plain numbers, and null for what is not finite."""
+        """For JSON: plain numbers, and null for NaN and infinities."""
         return jsonable(
             {
                 "title": self.title,

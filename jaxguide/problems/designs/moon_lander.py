@@ -1,4 +1,4 @@
-"""Moon lander: where the breaks of a fixed mesh belong, when the control switches."""
+"""Moon lander: the best places of a fixed mesh's breaks for a control that switches."""
 
 import dataclasses
 import math
@@ -20,13 +20,18 @@ from jaxguide.tuning.meshes import mesh_error
 from jaxguide.tuning.ready import Confirmed, Ready
 from jaxguide.tuning.record import Tuned
 
+# Coarse, so that the places of the breaks matter; 1e-10, as gradients are of the converged solve.
 METHOD = Pseudospectral(nodes=3, tolerance=1e-10, refinements=0)
 
 
 def design(segments: int = 4, steps: int = 200) -> Ready:
-    """Break points of `segments` segments of three nodes, from even ones, that leave the least
-    `mesh_error`: each gradient goes through the converged direct solve by the implicit function
-    theorem. The known switch is not told.
+    """Breaks of a mesh of `segments` segments of three nodes with the least `mesh_error`, starting
+    from even ones.
+
+    Each gradient goes through the converged direct solve by the implicit function theorem. The
+    switch is known in closed form (`switch`) but is not used to find the breaks.
+
+    **Arguments:** `steps`: of the optimiser.
 
     **Raises:** `ValueError` for fewer than two segments, which leave no break to move.
     """
@@ -57,8 +62,11 @@ def _build(own: dict[str, Any]) -> Extremal:
 
 
 def switch() -> tuple[float, float]:
-    """When full thrust begins and when it ends at rest on the ground, in closed form: the speed
-    after a fall of t is what full thrust takes out over the height that is left."""
+    """Times at which full thrust begins and at which the lander rests on the ground.
+
+    In closed form: after a free fall of t, full thrust must stop the speed within the remaining
+    height.
+    """
     lander = MoonLander()
     g, most = float(np.asarray(lander.gravity)), lander.control_bounds[1]
     (h, v), a = lander.initial_state, float(np.asarray(most)) - g

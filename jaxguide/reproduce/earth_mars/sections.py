@@ -1,4 +1,4 @@
-"""The report's sections: each judges what was computed against its reference."""
+"""The report's sections: each judges computed numbers against their references."""
 
 from typing import Any
 
@@ -152,7 +152,7 @@ def _errors(
 
 
 def wrong_sign(report: Report, flights: dict[str, Flight], reoptimised: list[Extremal]) -> None:
-    """Table 2 again, with gains from the wrong sign of H_uu: what the printed numbers may be."""
+    """Table 2 again, with gains from the wrong sign of H_uu, which the printed numbers resemble."""
     printed = np.asarray(TABLE_2)
     errors = final_errors(flights["wrong sign"], reoptimised)
     ratio = errors / printed
@@ -185,7 +185,7 @@ def dispersed(report: Report, dataset: Any) -> None:
         "Initial state dispersed by 1e-3 (one sigma) in each component, exact gains, du held over "
         "samples of 0.02 TU and capped at 0.3 rad, Runge-Kutta 4, seed 0. Standard deviations are "
         "beside those of linear covariance propagation through the same loop, to four standard "
-        "errors of a sampled one. v_r has none to first order: the law nulls it, so what is left "
+        "errors of a sampled one. v_r has none to first order: the law nulls it, so the rest "
         "is of second order. Percentiles carry 95 % confidence bounds.",
     )
     note = f"95 % bounds {low:.6f} to {high:.6f}"

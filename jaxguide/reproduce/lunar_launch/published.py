@@ -54,7 +54,7 @@ TABLE_5_2 = {
     7: (-3.13e-07, -0.000195, -3.15e-05),
     8: (-6.32e-07, -0.000389, -4.18e-05),
 }
-# Digits that the scan has lost, read from what is computed: table, node, row, column.
+# Digits that the scan has lost, restored from computed values: table, node, row, column.
 RESTORED = {
     ("5.1", 3, 1, "y"),
     ("5.1", 4, 1, "y"),

@@ -1,4 +1,4 @@
-"""The report's sections: each judges what was computed against the thesis or a reference."""
+"""The report's sections: each judges computed numbers against the thesis or a reference."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def nominal(report: Report, printed: Flight, converged: Extremal, optimum: Extre
     )
     ends = (printed.final_time, *np.asarray(printed.final_state))
     for name, value, wanted in zip(("tf", "x", "y", "u", "v"), ends, paper.END, strict=True):
-        # Half of the fifth digit printed, and what tf, used to seven, leaves uncertain: 5e-8 s
+        # Half of the fifth digit printed, and the uncertainty of tf, used to seven digits: 5e-8 s
         # times the rates at the end, 5444 ft/s, 0, 20.8 and 5 ft/s^2.
         tolerance = 5e-6 + 5e-8 * {"tf": 1, "x": 5444, "y": 0, "u": 20.8, "v": 5}[name]
         section.add(f"{name} of eq. (5.1)", value, wanted, printed=wanted, tolerance=tolerance)

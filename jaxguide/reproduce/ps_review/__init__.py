@@ -1,5 +1,5 @@
 """Ross & Karpenko, "A Review of Pseudospectral Optimal Control: From Theory to Flight" (Annual
-Reviews in Control 36, 2012), sections 3 and 4: what they say of grids, weights, covectors and
+Reviews in Control 36, 2012), sections 3 and 4: their statements on grids, weights, covectors and
 rates, computed.
 """
 

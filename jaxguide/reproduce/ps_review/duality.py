@@ -62,7 +62,7 @@ def mapping_matrix(family: str, weight: str, points: int) -> tuple[np.ndarray, f
     states = np.linalg.solve(f, u)
     r = states + f.T @ M / w[:, None]  # w (x - r) + f^T M = 0, no force at a fixed start
 
-    # Where the start is fixed, the costate equation there is what B^N does not impose.
+    # Where the start is fixed, problem B^N does not impose the costate equation there.
     held = np.flatnonzero(x == -1.0)
     rows = np.delete(np.arange(n), held)
     dual = weighted(x, d, weight) + np.diag(x)

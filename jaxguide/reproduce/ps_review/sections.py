@@ -128,9 +128,9 @@ def gaussian_grids(report: Report) -> None:
         "KKT solve. max |u - 1|: 1 is the bound itself. Where e(x_0, x_N) is taken at the first "
         "and last node though these are no ends, the interpolant is free beyond them: the control "
         "runs into its bounds, and with -1 no node the problem is not even convex (curvature < 0; "
-        "what is found meets the first-order conditions). "
-        "With the ends extrapolated LGR and LG are as good as LGL with W = 1; what the paper says "
-        "of W = 1 is true of its B^N, which has x_0 and x_N in e. W = 1 - t is no cure: x_2 and "
+        "the point found meets the first-order conditions). "
+        "With the ends extrapolated LGR and LG are as good as LGL with W = 1; the paper's "
+        "statement on W = 1 is true of its B^N, which has x_0 and x_N in e. W = 1 - t is no cure: x_2 and "
         "x_1 then vanish at the end, and no point within the bounds is left.",
     )
     for family, extrapolated, weight in CASES:
@@ -201,11 +201,11 @@ def covector_mapping(report: Report) -> None:
     """Review, figure 6, eqs. (23)-(25), Proposition 1, Remark 3."""
     section = report.section(
         "The covector mapping diagram (figure 6; eqs 23-25; Proposition 1)",
-        "x1' = x2, x2' = -t x1 + u, tracking what makes x1 = sin(3t + 0.4) optimal; errors of both "
-        "costates relative to the greatest. Discretise, then dualise: -multiplier/weight, raw, and "
+        "x1' = x2, x2' = -t x1 + u, with the target for which x1 = sin(3t + 0.4) is optimal; "
+        "errors of both costates relative to the greatest. Discretise, then dualise: -multiplier/weight, raw, and "
         "for LGL less the null mode gamma P_N fixed by both closure conditions. Dualise, then "
         "discretise: state and costate equations collocated, u from H_u = 0 (LGL: one equation "
-        "more than unknowns for each, by least squares; what remains is delta^N). The two ways "
+        "more than unknowns for each, by least squares; the residual is delta^N). The two ways "
         "around agree to rounding at all n on LG and spectrally on LGR and LGL.",
     )
     for family in ("lgl", "lgr-right", "lg"):
@@ -236,7 +236,8 @@ def _null_mode(report: Report) -> None:
         "method ends at a corner of it. The closure condition lambda(2) = 1 leaves gamma = 0. "
         "The paper's other method, Chebyshev (Remark 3), on the oscillator above: Clenshaw-Curtis "
         "weights integrate exactly to degree N only, the integration by parts of Table 1 fails, "
-        "and what B^N gives, multipliers over weights and controls alike, converges about as n^-2.",
+        "and the solution of B^N, multipliers over weights and controls alike, converges about as "
+        "n^-2.",
     )
     for points in (10, 20):
         raw, closed = uniform.lobatto_costate(points)
@@ -276,7 +277,7 @@ def infinite_horizon(report: Report) -> None:
         "An infinite horizon: LGR, W = 1 - t, bilinear map (eq. 6)",
         "x' = x + u, cost x^2 + u^2, x(0) = 1: J = 1 + sqrt 2 = 2.41421356... Here W = 1 does as "
         "well, since the running cost drives x to 0 at the end by itself. The reference gives "
-        "orders of magnitude: judged to half a decade, and what is below 1e-14 counts as 1e-14.",
+        "orders of magnitude: judged to half a decade; below 1e-14 counts as 1e-14.",
     )
     for points, reference in INFINITE.items():
         error = infinite.regulator_cost(points) - infinite.VALUE
@@ -294,8 +295,8 @@ def convergence(report: Report) -> None:
         "x' = u on LGL, 8 to 128 points. x = sin 2t + sgn(t-c) (t-c)^m is in W^{m,inf}. Slopes of "
         "log error over log(N - 1). Theorem 2: u_i = u(t_i), the least residual delta^N of B^N "
         "(closed form) and the state's error at it. The optimal solutions: of the problem that "
-        "tracks what makes x optimal, which puts the jump into the running cost where the theorems "
-        "ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, whose control "
+        "tracks the target for which x is optimal, so that the running cost has the jump, where "
+        "the theorems ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, whose control "
         "has a corner. The promised rates are bounds: a slope passes when it is no flatter. "
         "Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
     )
