@@ -41,9 +41,7 @@ def tried(name: str, guesses: int) -> None:
     at = "; ".join(f"{v} ({n})" for v, n in values.most_common())
     why = "; ".join(f"{v} ({n})" for v, n in reasons.most_common()) or "-"
     elapsed = time.perf_counter() - began
-    print(
-        f"| {name} | {certified} of {guesses} | {optima} | {why} | {error:+.0e} | {elapsed:.0f} |"
-    )
+    print(f"| {name} | {certified} of {guesses} | {at} | {why} | {error:+.0e} | {elapsed:.0f} |")
 
 
 def main() -> None:

@@ -130,8 +130,8 @@ def gaussian_grids(report: Report) -> None:
         "runs into its bounds, and with -1 no node the problem is not even convex (curvature < 0; "
         "the point found meets the first-order conditions). "
         "With the ends extrapolated LGR and LG are as good as LGL with W = 1; the paper's "
-        "statement on W = 1 is true of its B^N, which has x_0 and x_N in e. W = 1 - t is no cure: x_2 and "
-        "x_1 then vanish at the end, and no point within the bounds is left.",
+        "statement on W = 1 is true of its B^N, which has x_0 and x_N in e. W = 1 - t is no cure: "
+        "x_2 and x_1 then vanish at the end, and no point within the bounds is left.",
     )
     for family, extrapolated, weight in CASES:
         found = gaussian.solve_e2(family, 10, extrapolated, weight)
@@ -202,8 +202,8 @@ def covector_mapping(report: Report) -> None:
     section = report.section(
         "The covector mapping diagram (figure 6; eqs 23-25; Proposition 1)",
         "x1' = x2, x2' = -t x1 + u, with the target for which x1 = sin(3t + 0.4) is optimal; "
-        "errors of both costates relative to the greatest. Discretise, then dualise: -multiplier/weight, raw, and "
-        "for LGL less the null mode gamma P_N fixed by both closure conditions. Dualise, then "
+        "errors of both costates relative to the greatest. Discretise, then dualise: "
+        "-multiplier/weight, raw, and for LGL less the null mode gamma P_N fixed by both closure conditions. Dualise, then "
         "discretise: state and costate equations collocated, u from H_u = 0 (LGL: one equation "
         "more than unknowns for each, by least squares; the residual is delta^N). The two ways "
         "around agree to rounding at all n on LG and spectrally on LGR and LGL.",
@@ -296,8 +296,8 @@ def convergence(report: Report) -> None:
         "log error over log(N - 1). Theorem 2: u_i = u(t_i), the least residual delta^N of B^N "
         "(closed form) and the state's error at it. The optimal solutions: of the problem that "
         "tracks the target for which x is optimal, so that the running cost has the jump, where "
-        "the theorems ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, whose control "
-        "has a corner. The promised rates are bounds: a slope passes when it is no flatter. "
+        "the theorems ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, "
+        "whose control has a corner. The promised rates are bounds: a slope passes when it is no flatter. "
         "Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
     )
     for m in (2, 3, 4):
