@@ -91,11 +91,13 @@ class Saturated:
 
     @classmethod
     def state(cls, t: np.ndarray) -> np.ndarray:
+        """The optimal x at the times `t`."""
         later = cls.at_corner * np.cosh(1 - t) / np.cosh(1 - KINK)
         return np.where(t < KINK, cls.start - (t + 1), later)
 
     @classmethod
     def value(cls) -> float:
+        """The optimal J."""
         until = (cls.start**3 - cls.at_corner**3) / 3 + (KINK + 1)
         return float(until + cls.at_corner**2 * np.tanh(1 - KINK)) / 2
 

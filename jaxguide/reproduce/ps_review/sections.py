@@ -203,8 +203,8 @@ def covector_mapping(report: Report) -> None:
         "The covector mapping diagram (figure 6; eqs 23-25; Proposition 1)",
         "x1' = x2, x2' = -t x1 + u, with the target for which x1 = sin(3t + 0.4) is optimal; "
         "errors of both costates relative to the greatest. Discretise, then dualise: "
-        "-multiplier/weight, raw, and for LGL less the null mode gamma P_N fixed by both closure conditions. Dualise, then "
-        "discretise: state and costate equations collocated, u from H_u = 0 (LGL: one equation "
+        "-multiplier/weight, raw, and for LGL less the null mode gamma P_N fixed by both closure "
+        "conditions. Dualise, then discretise: state and costate equations collocated, u from H_u = 0 (LGL: one equation "
         "more than unknowns for each, by least squares; the residual is delta^N). The two ways "
         "around agree to rounding at all n on LG and spectrally on LGR and LGL.",
     )
@@ -297,8 +297,8 @@ def convergence(report: Report) -> None:
         "(closed form) and the state's error at it. The optimal solutions: of the problem that "
         "tracks the target for which x is optimal, so that the running cost has the jump, where "
         "the theorems ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, "
-        "whose control has a corner. The promised rates are bounds: a slope passes when it is no flatter. "
-        "Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
+        "whose control has a corner. The promised rates are bounds: a slope passes when it is no "
+        "flatter. Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
     )
     for m in (2, 3, 4):
         errors = np.array([rates.feasible(n, m) + rates.optimal(n, m) for n in rates.SIZES])

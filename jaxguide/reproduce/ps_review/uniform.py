@@ -38,6 +38,7 @@ class E1Solution(NamedTuple):
 
     @property
     def bounded_by_dual(self) -> bool:
+        """Whether some gamma is feasible in the dual."""
         return self.gamma[0] <= self.gamma[1]
 
 
