@@ -204,9 +204,9 @@ def covector_mapping(report: Report) -> None:
         "x1' = x2, x2' = -t x1 + u, with the target for which x1 = sin(3t + 0.4) is optimal; "
         "errors of both costates relative to the greatest. Discretise, then dualise: "
         "-multiplier/weight, raw, and for LGL less the null mode gamma P_N fixed by both closure "
-        "conditions. Dualise, then discretise: state and costate equations collocated, u from H_u = 0 (LGL: one equation "
-        "more than unknowns for each, by least squares; the residual is delta^N). The two ways "
-        "around agree to rounding at all n on LG and spectrally on LGR and LGL.",
+        "conditions. Dualise, then discretise: state and costate equations collocated, u from "
+        "H_u = 0 (LGL: one equation more than unknowns for each, by least squares; the residual is "
+        "delta^N). The two ways around agree to rounding at all n on LG and spectrally on LGR and LGL.",
     )
     for family in ("lgl", "lgr-right", "lg"):
         for points in (8, 12, 16, 24):
