@@ -22,7 +22,10 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parents[1]
-TILE = 512  # flights mapped together: by experiment on CPU, for `jg.rollouts` as for `jg.sweep`
+TILE = 512  # flights mapped together, so that memory stays small
+# LGL 32, that is 33 nodes; LGR with 6 nodes on each of 12 segments; the paper's 166 gains.
+WHOLE = {"lgl_nodes": 33, "lgr_segments": 12, "gains": 166, "flights": 65_536, "repeats": 20}
+SMALL = {"lgl_nodes": 9, "lgr_segments": 2, "gains": 12, "flights": 2 * TILE, "repeats": 1}
 
 
 def least(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
@@ -54,10 +57,11 @@ def measured(small: bool) -> dict[str, float]:
 
     from jaxguide import problems
 
-    repeats, problem = (1 if small else 20), problems.get("earth-mars")
+    size = SMALL if small else WHOLE
+    repeats, problem = size["repeats"], problems.get("earth-mars")
     meshes = {
-        "solve_lgl_32": jg.Pseudospectral("lgl", 9 if small else 33, 1, refinements=0),
-        "solve_lgr_6_x_12": jg.Pseudospectral("lgr-right", 6, 2 if small else 12, refinements=0),
+        "solve_lgl": jg.Pseudospectral("lgl", size["lgl_nodes"], 1, refinements=0),
+        "solve_lgr": jg.Pseudospectral("lgr-right", 6, size["lgr_segments"], refinements=0),
     }
     for name, method in meshes.items():
         at = lambda thrust, method=method: (
@@ -69,18 +73,17 @@ def measured(small: bool) -> dict[str, float]:
         out[f"{name}_first_s"], out[f"{name}_s"] = least(run, repeats)
 
     extremal = jg.solve(problem, jg.Shooting(starts=4))
-    times = jnp.arange(12 if small else 166) * 0.02
+    times = jnp.arange(size["gains"]) * 0.02
     schedules = jax.jit(lambda e: jg.gain_schedule(e, times).K)
     first, warm = least(lambda: schedules(extremal), 5 * repeats)
-    out["gains_166_first_s"], out["gains_166_s"] = first, warm
+    out["gains_first_s"], out["gains_s"] = first, warm
 
-    flights = 2 * TILE if small else 65_536
     loop, spread = problems.mission("earth-mars"), problems.dispersions("earth-mars")
     tile = lambda keys: jg.rollouts(loop, spread, keys).final_state
     fly = jax.jit(lambda keys: jax.lax.map(tile, keys))
-    keys = jax.random.split(jax.random.key(0), flights).reshape(-1, TILE)
+    keys = jax.random.split(jax.random.key(0), size["flights"]).reshape(-1, TILE)
     first, warm = least(lambda: fly(keys), min(repeats, 5))
-    out["rollouts_first_s"], out["flights_a_second"] = first, flights / warm
+    out["rollouts_first_s"], out["flights_a_second"] = first, size["flights"] / warm
     return out
 
 
@@ -135,6 +138,7 @@ def main() -> None:
     keys = rounds["new"][0]
     seconds = {name: {key: best(name, key) for key in keys} for name in paths}
     out = {
+        "sizes": SMALL if options.smoke else WHOLE,
         "rounds": len(rounds["new"]),
         "commits": {name: commit(path) for name, path in paths.items()},
         **seconds,

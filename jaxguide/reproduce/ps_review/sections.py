@@ -206,7 +206,8 @@ def covector_mapping(report: Report) -> None:
         "-multiplier/weight, raw, and for LGL less the null mode gamma P_N fixed by both closure "
         "conditions. Dualise, then discretise: state and costate equations collocated, u from "
         "H_u = 0 (LGL: one equation more than unknowns for each, by least squares; the residual is "
-        "delta^N). The two ways around agree to rounding at all n on LG and spectrally on LGR and LGL.",
+        "delta^N). The two ways around agree to rounding at all n on LG and spectrally on LGR and "
+        "LGL.",
     )
     for family in ("lgl", "lgr-right", "lg"):
         for points in (8, 12, 16, 24):
