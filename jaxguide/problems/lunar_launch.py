@@ -59,14 +59,8 @@ SAMPLE_INTERVAL = 4.0  # s: thesis, section 4.5
 # Powers of the time to go by which gains grow: 2 of a position (y), 1 of a velocity (u, v), 0 of x,
 # which has no gain.
 POWERS = (0.0, 2.0, 1.0, 1.0)
-QUIET = (
-    1.0  # s before the end in which the correction is not updated: by experiment, a fourth sample
-)
-MISS = (
-    100.0,
-    2.0,
-    10.0,
-)  # ft, ft/s, ft/s of y, u, v: a flight further off counts as failed (chosen)
+QUIET = 1.0  # s before the end in which the correction is not updated (chosen)
+MISS = (100.0, 2.0, 10.0)  # ft, ft/s, ft/s of y, u, v: further off, a flight has failed (chosen)
 
 
 def mission(

@@ -30,13 +30,9 @@ from jaxguide.tuning.risk import above, quantile_bounds, smooth_quantile
 
 LEVEL = 0.99  # of the percentile
 MOST = 166  # samples of 0.02 TU in 3.32
-MODES = (
-    12  # Legendre modes of the samples' density: the control turns within a tenth of the horizon
-)
+MODES = 12  # Legendre modes of the density: the control turns within a tenth of the horizon
 STEPS = 4  # of Runge-Kutta a sample while tuning: a tenth of a radian's turn a step at worst
-MARGIN = (
-    0.9  # of the paper's percentile as bound: with 512 cases the percentile scatters by a tenth
-)
+MARGIN = 0.9  # of the paper's percentile: that of 512 cases scatters by a tenth
 HOLDS = {"deviation": HoldDeviation, "history": History}
 
 
