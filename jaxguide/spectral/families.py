@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxguide.spectral.nodes import Nodes, check_end, nodes_cgl, nodes_lg, nodes_lgl, nodes_lgr
 
-# How far a quadrature rule may miss the integral of a Legendre polynomial, which is at most 2. The
-# five families miss by n eps, 1e-13 at n = 512; weights of nodes with digits lost miss by more than
-# this, and so does a rule of a lower degree than stated for n < 1000 (tests: 0.5 / n^3 or more).
+# How far a quadrature rule may miss the integral of a Legendre polynomial. The five families miss it
+# by n eps, 1e-13 at n = 512. A rule of a lower degree than stated misses by 0.5 / n^3 or more (tests),
+# which is above this for n < 1700.
 _EXACT = 1e-10
 # Nodes nearer to an end than this, but not on it, are rounding: the nearest of 512 Gauss nodes is
 # 1e-5 away.
@@ -55,8 +55,8 @@ class NodeFamily(eqx.Module):
     rule on the double integrator).
 
     **Fields** of a family, such as the exponents of Jacobi polynomials, are numbers, strings or
-    tuples of these, never arrays: a family is hashed, compared by value, and a static part of what
-    is compiled. `nodes` is called on the host alone, never under a trace, and its result is kept.
+    tuples of these, never arrays: a family is hashed, compared by value, and a static part of
+    compiled programs. `nodes` computes on the host, in NumPy; its result is kept.
 
     **Source:** Ross & Karpenko, review (2012), eqs. (10)-(16), and section 4.2.2 for why weights
     must be positive.
@@ -77,8 +77,8 @@ class NodeFamily(eqx.Module):
         sum_i w_i f(x_i) is the integral of f from -1 to 1 for polynomials f to `exact_degree(n)`,
         so that the weights sum to 2. The arrays may be read-only; callers do not write to them.
 
-        **Error:** nodes to 1e-15, weights to 1e-13 relative, or what is solved with them is no
-        better. Of the moments of `w`, 1e-10 is asked.
+        **Error:** of nodes 1e-15 and of weights 1e-13, relative, for solutions of full accuracy.
+        Checked is that `w` integrates Legendre polynomials to 1e-10.
 
         **Raises:** nothing for n >= `least`; it is not called with fewer.
         """
