@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxguide.spectral.nodes import Nodes, check_end, nodes_cgl, nodes_lg, nodes_lgl, nodes_lgr
 
-# How far a quadrature rule may miss the integral of a Legendre polynomial. The five families miss it
-# by n eps, 1e-13 at n = 512. A rule of a lower degree than stated misses by 0.5 / n^3 or more (tests),
-# which is above this for n < 1700.
+# How far a quadrature rule may miss the integral of a Legendre polynomial. The five families miss
+# it by n eps, 1e-13 at n = 512. A rule of a lower degree than stated misses by 0.5 / n^3 or more
+# (tests), which is above this for n < 1700.
 _EXACT = 1e-10
 # Nodes nearer to an end than this, but not on it, are rounding: the nearest of 512 Gauss nodes is
 # 1e-5 away.
