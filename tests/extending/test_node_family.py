@@ -39,7 +39,7 @@ def documented() -> jg.NodeFamily:
 
 class Jacobi(jg.NodeFamily):
     """The zeros of the Jacobi polynomial of two equal exponents, with or without the ends: 0 gives
-    LG, LGR and LGL, -1/2 what is Chebyshev's. Weights by interpolation."""
+    LG, LGR and LGL, -1/2 the Chebyshev families. Weights by interpolation."""
 
     exponent: float
     left: bool = False
