@@ -68,7 +68,7 @@ def main() -> None:
         row = json.loads(out.stdout.splitlines()[-1])
         print(line(row), flush=True)
         worst = max(worst, abs(row["error"]) - row["known"])
-    print(f"\nworst relative error beyond what is known: {worst:.1e}")
+    print(f"\nworst relative error beyond the reference's uncertainty: {worst:.1e}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Direct solves from random guesses: which converge, to what, and what is said of the others.
+"""Direct solves from random guesses: how many converge, to which optimum, and why others do not.
 
     python bench/robustness.py [--smoke]
 
@@ -38,10 +38,10 @@ def tried(name: str, guesses: int) -> None:
         values[f"{float(found.objective):.7g}"] += 1
     best = jg.solve(problem, jg.Pseudospectral(starts=8), throw=False)
     error = (float(best.objective) - known.value) / abs(known.value)
-    told = "; ".join(f"{v} ({n})" for v, n in values.most_common())
+    at = "; ".join(f"{v} ({n})" for v, n in values.most_common())
     why = "; ".join(f"{v} ({n})" for v, n in reasons.most_common()) or "-"
     elapsed = time.perf_counter() - began
-    print(f"| {name} | {certified} of {guesses} | {told} | {why} | {error:+.0e} | {elapsed:.0f} |")
+    print(f"| {name} | {certified} of {guesses} | {at} | {why} | {error:+.0e} | {elapsed:.0f} |")
 
 
 def main() -> None:

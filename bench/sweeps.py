@@ -33,7 +33,7 @@ import json, sys
 import jax
 jax.config.update("jax_enable_x64", True)
 import jaxguide as jg
-import jaxguide.montecarlo.sweep
+import jaxguide.sweeping.sweep
 jax.devices()
 # Linux; getrusage would count the parent's size before exec.
 lines = lambda: open("/proc/self/status").read().splitlines()
@@ -63,10 +63,10 @@ def limits(folder: str) -> dict[str, Path]:
 
 def limit(binary: Path, flights: int) -> float:
     environment = {**os.environ, "OMP_WAIT_POLICY": "passive"}
-    told = subprocess.run(
+    run = subprocess.run(
         [str(binary), str(flights)], capture_output=True, text=True, env=environment, check=True
     )
-    return json.loads(told.stdout)["rollouts_per_s"]
+    return json.loads(run.stdout)["rollouts_per_s"]
 
 
 def scipy_loop() -> float | None:
@@ -75,15 +75,15 @@ def scipy_loop() -> float | None:
     if not peer.exists():
         return None
     command = [sys.executable, str(peer), "--mode", "zoh"]
-    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-    return 1.0 / (told["sim_s_each"] * told["samples"])
+    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    return 1.0 / (found["sim_s_each"] * found["samples"])
 
 
 def memory(cases: int, dtype: str) -> dict[str, float]:
-    told = subprocess.run(
+    run = subprocess.run(
         [sys.executable, "-c", CHILD, str(cases), dtype], capture_output=True, text=True, check=True
     )
-    return json.loads(told.stdout.splitlines()[-1])
+    return json.loads(run.stdout.splitlines()[-1])
 
 
 def scaling(loop: Any, spread: Any, counts: tuple[int, ...], each: int) -> dict[str, float]:
@@ -158,14 +158,14 @@ def main() -> None:
             "wall_s": time.perf_counter() - began,
         }
     for dtype, rates in ours.items():
-        told: dict[str, Any] = {"rollouts_per_s": max(rates)}
+        entry: dict[str, Any] = {"rollouts_per_s": max(rates)}
         if theirs[dtype]:
-            told["c_rollouts_per_s"] = max(theirs[dtype])
-            told["ratio_of_best"] = max(rates) / max(theirs[dtype])
-            told["ratio_median"] = float(np.median(np.asarray(rates) / np.asarray(theirs[dtype])))
+            entry["c_rollouts_per_s"] = max(theirs[dtype])
+            entry["ratio_of_best"] = max(rates) / max(theirs[dtype])
+            entry["ratio_median"] = float(np.median(np.asarray(rates) / np.asarray(theirs[dtype])))
         if python:
-            told["times_the_scipy_loop"] = max(rates) / max(python)
-        out[dtype] = told
+            entry["times_the_scipy_loop"] = max(rates) / max(python)
+        out[dtype] = entry
     out["scipy_loop_rollouts_per_s"] = max(python, default=None)
 
     cases = 2000 if options.smoke else 50_000

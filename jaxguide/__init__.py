@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from jaxguide.solving.bellman import Bellman as Bellman
     from jaxguide.solving.bellman import bellman as bellman
     from jaxguide.solving.solve import solve as solve
+    from jaxguide.spectral.families import NodeFamily as NodeFamily
     from jaxguide.sweeping.compare import compare as compare
     from jaxguide.sweeping.stopping import PercentileWithin as PercentileWithin
     from jaxguide.sweeping.stopping import SuccessWithin as SuccessWithin
@@ -95,6 +96,7 @@ _HOME = {
     "MultivariateNormal": "montecarlo.dispersions",
     "NeighboringOptimal": "laws.neighboring",
     "NeighboringSuboptimal": "laws.suboptimal",
+    "NodeFamily": "spectral.families",
     "Normal": "montecarlo.dispersions",
     "OpenLoop": "laws.law",
     "PercentileWithin": "sweeping.stopping",

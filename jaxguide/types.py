@@ -16,9 +16,10 @@ Control = Float[Array, " control"]
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a computation ended. `successful`, or a reason that names the remedy.
+    """How a computation ended: `successful`, or a reason whose message names the remedy.
 
-    Extends the enumerations of Diffrax, Optimistix and Lineax, so `RESULTS.promote` lifts theirs.
+    Extends the enumerations of Diffrax, Optimistix and Lineax, so that `RESULTS.promote` lifts
+    theirs. Members compare with `==` and merge with `RESULTS.where`, also under a trace.
     """
 
     successful = ""
@@ -85,8 +86,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     hidden_horizon = (
         "The final time is infinite, which could not be seen under the trace, and decides how a "
-        "problem is solved: keep it a concrete jnp.inf in what is traced, differentiating or "
-        "mapping over other fields only."
+        "problem is solved: keep it a concrete jnp.inf, and differentiate or map over other fields "
+        "only."
     )
 
 
@@ -96,12 +97,12 @@ def code(result: RESULTS) -> int:
 
 
 def succeeded(result: RESULTS) -> bool:
-    """Whether one result is success. Host only; `==` is what compares under a trace."""
+    """Whether one result is success. Host only; under a trace, compare with `==`."""
     return code(result) == code(RESULTS.successful)
 
 
 def message(number: int) -> str:
-    """The name of a stored result."""
+    """The name of a result stored by its `code`, or "code N" if there is none."""
     for name in RESULTS._name_to_item:  # pyright: ignore
         if code(getattr(RESULTS, name)) == number:
             return name
@@ -109,21 +110,30 @@ def message(number: int) -> str:
 
 
 class UnknownName(ValueError):
-    """A name that is not registered; the message suggests the nearest that is."""
+    """A name that is not registered; the message suggests the nearest one that is.
+
+    **Arguments:** `kind`: of the thing named ("problem"); `known`: the registered names.
+    """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]):
         known = tuple(known)
+        # 0.4 for difflib's 0.6: names are few, so that a distant suggestion is still of use.
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
         super().__init__(f"no {kind} named {name!r}: {hint}")
 
 
 class SolveError(RuntimeError):
-    """An outermost solve failed; the message says what was worst and what to try."""
+    """An outermost solve failed; the message names the worst condition and what to try."""
 
 
 def require_x64(what: str) -> None:
-    """Raises `RuntimeError` unless float64 is enabled, which `what` needs for its accuracy."""
+    """Checks that JAX runs in float64.
+
+    **Arguments:** `what`: the function that needs it, for the message.
+
+    **Raises:** `RuntimeError`, with the remedy, if it runs in float32.
+    """
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} needs float64, but JAX is running in float32. Call "
@@ -133,7 +143,7 @@ def require_x64(what: str) -> None:
 
 
 def is_traced(tree: object) -> bool:
-    """Whether any leaf of `tree` is a tracer, so that host-side checks must be skipped."""
+    """Whether any leaf of `tree` is a tracer; then its values cannot be checked on the host."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
 
 

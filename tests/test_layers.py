@@ -46,6 +46,7 @@ ORDER: dict[str, tuple[str, ...]] = {
     ),
     "spectral": (
         "nodes",
+        "families",
         "barycentric",
         "grids",
         "interpolation",

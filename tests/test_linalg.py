@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxguide.linalg import SmallLU, cholesky_positive, left_null_space, solve
+from jaxguide.linalg import SmallLU, cholesky_positive, gauss_solve, left_null_space
 
 EPS = np.finfo(float).eps
 
@@ -20,19 +20,21 @@ def matrix(n, seed=0):
 @pytest.mark.parametrize("n", [1, 2, 6, 8, 9, 30])
 def test_solve_is_backward_stable(n):
     a, b = matrix(n), np.random.default_rng(1).normal(size=(n, 3))
-    x = np.asarray(solve(jnp.asarray(a), jnp.asarray(b)))
+    x = np.asarray(gauss_solve(jnp.asarray(a), jnp.asarray(b)))
     # Gauss-Jordan with partial pivoting: the residual is a few n eps |A| |x| (Higham, 2002,
     # section 14.4); growth of the pivots is below n for random matrices.
     assert np.abs(a @ x - b).max() <= 10 * n * n * EPS * np.abs(a).max() * np.abs(x).max()
-    one = np.asarray(solve(jnp.asarray(a), jnp.asarray(b[:, 0])))
+    one = np.asarray(gauss_solve(jnp.asarray(a), jnp.asarray(b[:, 0])))
     assert one.shape == (n,)
     np.testing.assert_allclose(one, x[:, 0], rtol=1e-10)
 
 
 def test_solve_pivots():
     # Zero leading entry; and a pivot of 1e-20, which without a row exchange loses everything.
-    np.testing.assert_array_equal(solve(jnp.array([[0.0, 1], [2, 0]]), jnp.array([3.0, 4])), [2, 3])
-    got = solve(jnp.array([[1e-20, 1.0], [1.0, 1.0]]), jnp.array([1.0, 2.0]))
+    np.testing.assert_array_equal(
+        gauss_solve(jnp.array([[0.0, 1], [2, 0]]), jnp.array([3.0, 4])), [2, 3]
+    )
+    got = gauss_solve(jnp.array([[1e-20, 1.0], [1.0, 1.0]]), jnp.array([1.0, 2.0]))
     np.testing.assert_allclose(got, [1, 1], rtol=4 * EPS)
 
 
@@ -41,33 +43,33 @@ def test_solve_in_wide_scales():
     d = np.array([1e-8, 1e3, 1.0, 1e6])
     a, b = matrix(4) * d[:, None], matrix(4, 1)[:, 0]
     np.testing.assert_allclose(
-        solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-12
+        gauss_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-12
     )
 
 
 def test_singular_matrix_gives_no_finite_answer():
-    got = solve(jnp.array([[1.0, 2.0], [2.0, 4.0]]), jnp.array([1.0, 1.0]))
+    got = gauss_solve(jnp.array([[1.0, 2.0], [2.0, 4.0]]), jnp.array([1.0, 1.0]))
     assert not np.all(np.isfinite(got))
 
 
 @pytest.mark.parametrize("n", [3, 10])
 def test_solve_derivatives(n):
     a, b = jnp.asarray(matrix(n)), jnp.asarray(matrix(n, 1)[:, :2])
-    check_grads(jax.jit(solve), (a, b), order=2, modes=["fwd", "rev"])
+    check_grads(jax.jit(gauss_solve), (a, b), order=2, modes=["fwd", "rev"])
 
 
 def test_solve_batches():
     # A batch of 64 is where vmapped LAPACK calls have hung.
     a = jnp.asarray(np.random.default_rng(2).normal(size=(64, 5, 5)))
     b = jnp.asarray(np.random.default_rng(3).normal(size=(64, 5)))
-    got = jax.jit(jax.vmap(solve))(a, b)
+    got = jax.jit(jax.vmap(gauss_solve))(a, b)
     want = np.stack([np.linalg.solve(p, q) for p, q in zip(a, b, strict=True)])
     # The worst of 64 random matrices has a condition number of some 1e3.
     np.testing.assert_allclose(got, want, rtol=1e-10, atol=1e-10)
 
 
 def test_solve_uses_no_lapack():
-    text = jax.jit(jax.vmap(solve)).lower(jnp.ones((4, 3, 3)), jnp.ones((4, 3))).as_text()
+    text = jax.jit(jax.vmap(gauss_solve)).lower(jnp.ones((4, 3, 3)), jnp.ones((4, 3))).as_text()
     assert "lapack" not in text
 
 

@@ -50,13 +50,13 @@ def test_figures(tmp_path):
 def test_uniform_weights_are_newton_cotes():
     """10 points, h = 2/9: Abramowitz & Stegun (1964), eq. 25.4.20."""
     known = np.array([2857, 15741, 1080, 19344, 5778]) * 9 / 89600 * 2 / 9
-    w = uniform.solve(10).w
+    w = uniform.solve_e1(10).w
     np.testing.assert_allclose(w, np.concatenate([known, known[::-1]]), atol=1e-14)
 
 
 @pytest.mark.parametrize("points", [9, 10, 11, 12, 13])
 def test_dual_interval_tells_whether_e1_is_bounded(points):
-    found = uniform.solve(points)
+    found = uniform.solve_e1(points)
     assert found.unbounded is (points > 11) is (not found.bounded_by_dual)
     assert np.any(found.w < 0) == (points != published.POSITIVE_POINTS)
     if not found.unbounded:
@@ -69,7 +69,7 @@ def test_dual_interval_tells_whether_e1_is_bounded(points):
 @pytest.mark.parametrize("family", ["lgl", "lgr-left", "lg"])
 def test_e2_agrees_with_another_optimiser(family):
     """SLSQP on the same program finds the same control where the ends are at nodes."""
-    own = gaussian.solve(family, 10)
+    own = gaussian.solve_e2(family, 10)
     n, grid = 10, boundary.review_grid(family, 10)
 
     def defects(z):
@@ -90,14 +90,14 @@ def test_e2_agrees_with_another_optimiser(family):
 
 
 def test_e2_curvature_is_negative_only_without_the_start():
-    assert gaussian.solve("lgr-left", 10).curvature > 0 > gaussian.solve("lg", 10).curvature
+    assert gaussian.solve_e2("lgr-left", 10).curvature > 0 > gaussian.solve_e2("lg", 10).curvature
 
 
 def test_quadratic_program_against_a_projection():
     """With H = 1 and no equality the solution is the clipped centre."""
     centre = np.linspace(-2, 2, 7)
     one = np.ones(7)
-    found = qp.minimise(np.eye(7), -centre, np.zeros((0, 7)), np.zeros(0), -one, one)
+    found = qp.solve_qp(np.eye(7), -centre, np.zeros((0, 7)), np.zeros(0), -one, one)
     np.testing.assert_allclose(found.z, np.clip(centre, -1, 1), atol=1e-15)
     np.testing.assert_allclose(found.bound, centre - found.z, atol=1e-15)
     assert found.violation < 1e-15
@@ -105,7 +105,7 @@ def test_quadratic_program_against_a_projection():
 
 def test_a_failed_quadratic_program_says_so():
     both = np.array([[1.0, 1.0]])  # x + y = 3 within the unit box: nothing
-    found = qp.minimise(np.eye(2), np.zeros(2), both, np.array([3.0]), -np.ones(2), np.ones(2))
+    found = qp.solve_qp(np.eye(2), np.zeros(2), both, np.array([3.0]), -np.ones(2), np.ones(2))
     assert found.violation > 0.4
 
 
@@ -170,8 +170,8 @@ def test_gauss_commutes_at_every_size():
 @pytest.mark.parametrize("weight", ["1-t", "1"])
 def test_infinite_horizon(weight):
     # Geometric: five digits for ten points, from the reference's orders of magnitude.
-    assert abs(infinite.cost(20, weight) - infinite.VALUE) < 1e-9
-    assert abs(infinite.cost(40, weight) - infinite.VALUE) < 1e-13
+    assert abs(infinite.regulator_cost(20, weight) - infinite.VALUE) < 1e-9
+    assert abs(infinite.regulator_cost(40, weight) - infinite.VALUE) < 1e-13
 
 
 def test_feasible_point_of_theorem_2_attains_its_residual():
@@ -213,7 +213,7 @@ def test_saturated_solution():
 def test_multipliers_satisfy_the_conditions_of_the_discrete_problem():
     p, rule = covectors.oscillator(), collocation("lgr-right", 9)
     ends = lq.end_rows(rule, extrapolated=True)
-    system = lq.assemble(rule, p, ends)
+    system = lq.quadratic_program(rule, p, ends)
     found = lq.discretise(rule, p, ends)
     z = np.concatenate([found.x.reshape(-1), found.u])
     y = np.concatenate([found.defect.reshape(-1), found.end[0]])

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 import jaxguide as jg
 from jaxguide import problems
 from jaxguide.nominal.direct import newton_system
-from jaxguide.nominal.direct.collocation import FAMILIES, collocation, left_null
+from jaxguide.nominal.direct.collocation import collocation, left_null
 from jaxguide.nominal.direct.elimination import eliminate
 from jaxguide.nominal.direct.guess import edges
 from jaxguide.nominal.direct.kkt_factor import factorise
@@ -20,6 +20,7 @@ from jaxguide.nominal.direct.kkt_step import newton_step
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Equations, Primal, Scale
 from jaxguide.problems import EarthMars
+from jaxguide.spectral import FAMILIES
 
 
 @pytest.mark.parametrize("family", FAMILIES)

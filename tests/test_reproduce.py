@@ -163,7 +163,7 @@ def test_host_interpolation_is_exact_for_the_mesh_degree():
 @pytest.mark.parametrize("N", [2, 9, 64])
 def test_host_differentiation_matrix_is_the_library_s(N):
     library = differentiation_matrix(jnp.asarray(nodes_lgl(N + 1)[0]))
-    np.testing.assert_allclose(collocation.differentiation(N), library, atol=1e-12 * N**2)
+    np.testing.assert_allclose(collocation.lgl_differentiation(N), library, atol=1e-12 * N**2)
 
 
 def test_host_collocation_of_the_double_integrator():
@@ -173,9 +173,9 @@ def test_host_collocation_of_the_double_integrator():
     psi = np.concatenate([np.eye(2), np.zeros((2, 2))], axis=1)
     U = np.array([[0.0, 0.0, 0.0, -1.0]])
     t = nodes_lgl(9)[0] + 1
-    system = collocation.System(np.tile(M, (9, 1, 1)), np.tile(U, (9, 1, 1)), psi)
+    system = collocation.HamiltonianSystem(np.tile(M, (9, 1, 1)), np.tile(U, (9, 1, 1)), psi)
     for square in (False, True):
-        K = U @ collocation.horizon(t, system, square)[0]
+        K = U @ collocation.collocated_horizon(t, system, square)[0]
         np.testing.assert_allclose(K, [[-1.5, -2.0]], atol=1e-12)
 
 

@@ -16,7 +16,7 @@ from conftest import SMALL, DoubleIntegrator, ForcedLQR, FreeTime, Regulator, at
 from scipy import integrate, optimize
 
 import jaxguide as jg
-from jaxguide.nominal.indirect.shooting import _judge
+from jaxguide.nominal.indirect.shot import judged
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars.published import ANGLES, COSTATE_END, COSTATE_START, RADIUS
 
@@ -363,7 +363,7 @@ def test_controls_that_do_not_minimise_are_refused(regulator, r):
 
 def test_not_minimising_is_told_apart(earth_mars):
     e = earth_mars
-    judge = lambda u: _judge(e.problem, e.t, e.x, u, e.costate, e.residual, e.objective)
+    judge = lambda u: judged(dataclasses.replace(e, u=u), e.residual)
     assert bool(judge(e.u) == jg.RESULTS.successful)
     assert bool(judge(e.u + jnp.pi) == jg.RESULTS.not_minimising)  # H maximised
 

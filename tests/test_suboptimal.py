@@ -137,7 +137,7 @@ def test_printed_gains(thesis):
 
 def test_printed_flights(thesis):
     """Rows t of Tables 5.3 and 5.4: 1e-3 s, 0.1 ft, 2e-3 and 5e-3 ft/s."""
-    flown = flights.fly_cases(thesis)
+    flown = flights.fly_plants(thesis)
     off = flights.ends(flown) - np.array([case.by_time for case in flights.CASES])
     misprint = flights.CASES[3].percent == -2 and ("5.3", -2.0, "t", 0) in published.MISPRINTS
     assert misprint and off[3, 0] == pytest.approx(1.5e-3, abs=1e-3)

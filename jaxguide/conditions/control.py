@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.conditions.hamiltonian import hamiltonian
-from jaxguide.linalg import cholesky_positive, solve
+from jaxguide.linalg import cholesky_positive, gauss_solve
 from jaxguide.problem import Problem, start_control
 
 _MAX_STEPS = 40
@@ -50,7 +50,7 @@ def newton_control(
         lowest = jnp.min(jnp.diag(h_uu) - radius)
         size = jnp.max(jnp.abs(h_uu)) + jnp.finfo(u.dtype).tiny
         shift = jnp.where(cholesky_positive(h_uu), 0.0, jnp.maximum(0.1 * size - lowest, 0.0))
-        return g, -solve(h_uu + shift * eye, g)
+        return g, -gauss_solve(h_uu + shift * eye, g)
 
     def body(carry: tuple) -> tuple:
         u, _, k = carry
@@ -70,7 +70,7 @@ def newton_control(
         return jax.lax.while_loop(going, body, start)[0]
 
     def tangent_solve(g: Any, y: Array) -> Array:
-        return solve(jax.jacfwd(g)(jnp.zeros_like(y)), y)
+        return gauss_solve(jax.jacfwd(g)(jnp.zeros_like(y)), y)
 
     return jax.lax.custom_root(gradient, guess, search, tangent_solve)
 
@@ -95,6 +95,6 @@ def polish_control(
     scale = jnp.max(jnp.abs(h_uu))
     regular = (scale > 0) & jnp.all(force <= _FREE * scale * (1 + jnp.abs(u)))
     safe = jnp.where(regular, h_uu, jnp.eye(u.shape[0], dtype=u.dtype))
-    step = solve(safe, h_u)
+    step = gauss_solve(safe, h_u)
     small = regular & jnp.all(jnp.abs(step) <= 1e-3 * (1 + jnp.abs(u)))
     return jnp.where(small, u - jnp.where(small, step, 0.0), u)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import bounds_of
-from jaxguide.linalg import solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.linearization import refuse_integrals, terminal_conditions
 from jaxguide.neighboring.segmented import (
@@ -126,7 +126,7 @@ class CollocatedSchedule(GainSchedule):
         # du(t) = C(t) dx(t_k) and dx(t) = X(t) dx(t_k) on the horizon begun at t_k <= t.
         t = jnp.clip(jnp.asarray(t, self.times.dtype), self.times[0], self.times[-1])
         x, u = self._at(self._sample(t), t)
-        return solve(x.T, u.T).T
+        return gauss_solve(x.T, u.T).T
 
     def history(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         t_k, t = (jnp.asarray(v, self.times.dtype) for v in (t_k, t))

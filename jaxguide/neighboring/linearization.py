@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of
 from jaxguide.conditions.hamiltonian import endpoint_lagrangian, hamiltonian
-from jaxguide.linalg import left_null_space, solve
+from jaxguide.linalg import gauss_solve, left_null_space
 from jaxguide.problem import Problem, is_free, replace_parameters
 from jaxguide.trajectory import Extremal
 
@@ -110,7 +110,7 @@ def canonical(v: SecondVariation) -> Canonical:
 def _inverse_times(h_uu: Array, rows: Array) -> Array:
     if h_uu.shape[0] == 1:
         return rows / h_uu[0, 0]
-    return solve(h_uu, rows)
+    return gauss_solve(h_uu, rows)
 
 
 class Terminal(NamedTuple):

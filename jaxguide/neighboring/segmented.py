@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.linalg import cholesky_positive, solve
+from jaxguide.linalg import cholesky_positive, gauss_solve
 from jaxguide.neighboring.linearization import Canonical, Terminal, canonical, second_variation
 from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
@@ -305,7 +305,7 @@ def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> Gains:
     n = two_n // 2
     G = sweep.rows(t)
     known = jnp.concatenate([G[:n, :n], G[:n, two_n:]], axis=1)
-    inverse = solve(G[:n, n:two_n], jnp.eye(n, dtype=G.dtype))
+    inverse = gauss_solve(G[:n, n:two_n], jnp.eye(n, dtype=G.dtype))
     S = -inverse @ known
     # One step of refinement, and Skeel's bound of what rounding leaves.
     S = S - inverse @ (G[:n, n:two_n] @ S + known)
@@ -350,7 +350,7 @@ def propagate(sweep: Sweep, t_from: Array, t_to: Array) -> Float[Array, "two_n n
         right = sweep.transition(i, r)[:, :two_n]
         G = sweep.ends[i][:n, :two_n] @ left
         rows = _orthonormal_rows(G, n, two_n)
-        start = jnp.concatenate([jnp.eye(n, dtype=G.dtype), -solve(G[:, n:], G[:, :n])])
+        start = jnp.concatenate([jnp.eye(n, dtype=G.dtype), -gauss_solve(G[:, n:], G[:, :n])])
         z = left @ jnp.where(i == first, start, y - rows.T @ (rows @ y))
         # inverse of [[a, b], [c, d]] symplectic is [[d^T, -b^T], [-c^T, a^T]]
         a, b, c, d = right[:n, :n], right[:n, n:], right[n:, :n], right[n:, n:]

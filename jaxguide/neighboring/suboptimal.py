@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.linalg import solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, polished
 from jaxguide.problem import is_free
@@ -79,7 +79,7 @@ class Sensitivities(NamedTuple):
     def Phi(self) -> Float[Array, "g n n"]:
         """Transition matrix of eq. (3.8), dx = Phi dx_f + Psi da: eqs (3.12), (3.14)."""
         eye = jnp.broadcast_to(jnp.eye(self.end_state.shape[1]), self.end_state.shape)
-        return jax.vmap(solve)(self.end_state, eye)
+        return jax.vmap(gauss_solve)(self.end_state, eye)
 
     @property
     def Psi(self) -> Float[Array, "g n p"]:
@@ -220,7 +220,7 @@ def _schedule(
         D, C = D / rows, s.psi_state / rows
         kkt = jnp.block([[G / scale, D.T], [D, jnp.zeros((q, q), G.dtype)]])
         right = jnp.concatenate([jnp.where(active[:, None], s.G_ax, 0.0) / scale, C])
-        return -solve(kkt, right)[:p], _dependence(D)
+        return -gauss_solve(kkt, right)[:p], _dependence(D)
 
     K, rank = jax.vmap(gain)(s, active)
     n = problem.n
@@ -232,7 +232,7 @@ def _schedule(
     points = extremal.reference_nodes
     exponents = jnp.arange(points.shape[0] - 1, -1, -1).astype(points.dtype)
     powers = points[:, None] ** exponents[None, :]
-    polynomials = jax.vmap(lambda x: solve(powers, x))(extremal.by_segment(extremal.x))
+    polynomials = jax.vmap(lambda x: gauss_solve(powers, x))(extremal.by_segment(extremal.x))
     schedule = SuboptimalSchedule(
         stations=stations,
         positions=positions,

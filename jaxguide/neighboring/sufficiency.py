@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.linalg import cholesky_positive, solve
+from jaxguide.linalg import cholesky_positive, gauss_solve
 from jaxguide.neighboring.segmented import Sweep
 
 
@@ -23,8 +23,8 @@ def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
         forward = sweep.transition(i, l)[:, : 2 * n]  # its inverse is [[d^T, -b^T], ...]
         b, d = forward[:n, n:], forward[n:, n:]
         G = sweep.ends[i][:n, : 2 * n]
-        S = -solve(G[:, n:], G[:, :n])
-        L = _root(-solve(d.T, b.T))
+        S = -gauss_solve(G[:, n:], G[:, :n])
+        L = _root(-gauss_solve(d.T, b.T))
         return ~cholesky_positive(eye + L.T @ ((S + S.T) / 2) @ L)
 
     # Nothing is conjugate within the last segment of a resolved mesh, where S may be infinite.

@@ -1,8 +1,9 @@
-"""Figures of extremals, gains, flights and sweeps. Host only; no pyplot, so no display is needed.
+"""Figures of extremals, gains, flights, sweeps and tuning. Host only; no display is needed, as
+pyplot is not used.
 
-Each `plot_` function returns a `matplotlib.figure.Figure`; `save` writes it. Every line has its own
-dash pattern as well as its own colour, so that figures survive a black and white printer. `units`
-maps names of states and controls, and "t", to units shown on the axes.
+Each `plot_` function returns a `matplotlib.figure.Figure`; `save` writes it to a file. Every line
+has a dash pattern of its own beside its colour, so that figures can be read in black and white.
+Everywhere `units` maps names of states and controls, and "t", to the units shown on the axes.
 """
 
 from jaxguide.plotting.style import COLOURS as COLOURS

@@ -1,4 +1,7 @@
-"""How figures look: colours, dashes, symbols, axes, and how they are written."""
+"""The style of all figures: colours, dashes, symbols, axes; and writing them to files.
+
+Sizes of type, lines and markers were chosen by eye, for figures as wide as a page's text.
+"""
 
 import functools as ft
 import re
@@ -12,7 +15,8 @@ from matplotlib.figure import Figure
 
 Units = Mapping[str, str] | None
 
-# Okabe & Ito's colours, dark ones first: distinct to colour-blind readers, and in grey by dashes.
+# Okabe & Ito's colours (Color Universal Design, 2008), dark ones first: distinct to colour-blind
+# readers. In grey, dashes tell lines apart.
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 DASHES: tuple[Any, ...] = (
     "-",
@@ -45,7 +49,7 @@ _GREEK = {"alpha", "beta", "gamma", "delta", "epsilon", "theta", "phi", "psi", "
 
 
 def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
-    """Draws under this module's style, leaving the caller's matplotlib settings alone."""
+    """Decorator: draws under this module's style; the caller's matplotlib settings stay."""
 
     @ft.wraps(draw)
     def call(*args: Any, **options: Any) -> Figure:
@@ -56,9 +60,12 @@ def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
 
 
 def save(figure: Figure, path: Path, dpi: float = 200.0) -> str:
-    """Writes `figure`, makes folders as needed, and returns the path.
+    """Writes `figure` to `path`, whose ending gives the format, and returns the path.
 
-    `savefig` alone would draw it twice, the first time to lay it out.
+    Folders are made as needed. The layout is computed here, once: `savefig` alone would draw the
+    figure twice, the first time to lay it out.
+
+    **Arguments:** `dpi`: dots per inch of raster formats.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.set_dpi(dpi)
@@ -71,12 +78,13 @@ def save(figure: Figure, path: Path, dpi: float = 200.0) -> str:
 
 
 def line(i: int) -> dict[str, Any]:
-    """Colour and dashes of the i-th line."""
+    """Colour and dashes of the i-th line, as keywords of `Axes.plot`; they repeat after seven."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i % len(DASHES)]}
 
 
 def symbol(name: str, prefix: str = "") -> str:
-    """A name as set type: v_r as v with a subscript, greek letters as such, words as words."""
+    """A name as TeX for Matplotlib: v_r as v with a subscript, Greek letters as symbols, other
+    words as they are. `prefix`: TeX to stand before it, such as a delta."""
     head, _, tail = name.partition("_")
     short = re.fullmatch(r"[A-Za-z]", head) or head in _GREEK
     if not short or (tail and not re.fullmatch(r"[A-Za-z0-9]{1,3}", tail)):
@@ -88,26 +96,30 @@ def symbol(name: str, prefix: str = "") -> str:
 
 
 def costate_symbol(name: str) -> str:
-    """lambda with the state as its subscript."""
+    """The costate of the state `name`: lambda with the state's symbol as subscript."""
     inner = symbol(name)
     return rf"$\lambda_{{{inner[1:-1]}}}$" if inner.startswith("$") else rf"$\lambda$ of {inner}"
 
 
 def label(name: str, units: Units, prefix: str = "") -> str:
-    """`symbol` with its unit."""
+    """`symbol` with its unit in brackets, if `units` has one."""
     unit = (units or {}).get(name, "")
     return f"{symbol(name, prefix)} [{unit}]" if unit else symbol(name, prefix)
 
 
-def grid(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, np.ndarray]:
+def panel_grid(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure of `rows` x `columns` panels, each row `height` inches high, and its axes, shape
+    (rows, columns). `options`: of `Figure.subplots`."""
     figure = Figure(figsize=(WIDTH if columns > 1 else 0.72 * WIDTH, height * rows))
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def time_axis(axes: np.ndarray, units: Units) -> None:
+    """Labels the lowest row of `axes` with time."""
     for axis in axes[-1]:
         axis.set_xlabel(label("t", units))
 
 
 def names_of(problem: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the states and of the controls of a Problem."""
     return tuple(problem.state_names), tuple(problem.control_names)

@@ -12,10 +12,13 @@ from jaxguide.plotting.style import WIDTH, Units, label, line, styled
 
 @styled
 def plot_sweep(dataset: Any, units: Units = None) -> Figure:
-    """Final states of a sweep: histograms on the diagonal, pairs below it.
+    """Final states of a sweep, from that of the undispersed flight: histograms on the diagonal,
+    pairs below it.
 
-    The pairs carry three-sigma ellipses of the sampled covariance and, dashed, of the linear one;
-    the histograms, the 1st, 50th and 99th percentiles. Failed cases are counted in the title.
+    Pairs show three-sigma ellipses of the sampled covariance and, dashed, of the linear one;
+    histograms show the 1st, 50th and 99th percentiles. The title counts the successful cases.
+
+    **Arguments:** `dataset`: of `jg.sweep` with `keep="all"`.
     """
     names = [str(s) for s in np.asarray(dataset["state"])]
     good = np.isfinite(np.asarray(dataset["final_state"])).all(axis=1)
@@ -25,7 +28,7 @@ def plot_sweep(dataset: Any, units: Units = None) -> Figure:
     n = len(names)
     figure = Figure(figsize=(WIDTH, 0.86 * WIDTH))
     axes = figure.subplots(n, n, squeeze=False)
-    # Final states scatter by little about large values: show them from the undispersed end.
+    # Final states scatter little about large values, so they are shown from the undispersed end.
     nominal = np.asarray(attrs["nominal_final_state"], float)
     values = finals - nominal[None, :]
     sampled = np.asarray(attrs["sample_covariance"], float)
@@ -67,7 +70,10 @@ def plot_sweep(dataset: Any, units: Units = None) -> Figure:
 
 
 def align(axes: np.ndarray, texts: list[str]) -> None:
-    """Columns share their abscissa, rows of pairs their ordinate; only the outer axes say which."""
+    """Gives columns one abscissa and rows of pairs one ordinate; only the outer axes are labelled.
+
+    **Arguments:** `axes` (n, n): of a corner plot; `texts`: labels of the n quantities.
+    """
     n = len(axes)
     for j in range(n):
         limits = [axes[i, j].get_xlim() for i in range(j, n)]
@@ -101,7 +107,10 @@ def _histogram(axis: Axes, values: np.ndarray) -> None:
 
 
 def ellipse(axis: Axes, centre: np.ndarray, covariance: np.ndarray, **options: Any) -> None:
-    """Three-sigma ellipse of a 2 x 2 covariance."""
+    """Draws the three-sigma ellipse of a 2 x 2 `covariance` about `centre`.
+
+    **Arguments:** `options`: of `matplotlib.patches.Ellipse`; `label` among them is required.
+    """
     size, vectors = np.linalg.eigh(covariance)
     width, height = 6 * np.sqrt(np.maximum(size[::-1], 0.0))
     angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))

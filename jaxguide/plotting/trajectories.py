@@ -11,10 +11,10 @@ from jaxguide.plotting.style import (
     MARKERS,
     Units,
     costate_symbol,
-    grid,
     label,
     line,
     names_of,
+    panel_grid,
     styled,
     symbol,
     time_axis,
@@ -24,10 +24,11 @@ from jaxguide.spectral.grids import evaluation
 
 @styled
 def plot_extremal(extremal: Any, units: Units = None) -> Figure:
-    """Control, states and costates of an Extremal (2002 paper, figure 2; the costates beside)."""
+    """Controls, states and costates of an Extremal against time (2002 paper, figure 2, and the
+    costates)."""
     states, controls = names_of(extremal.problem)
     breaks, reference, pieces = _pieces(extremal)
-    # Between the nodes too, which lie far apart on a mesh that has moved elsewhere.
+    # Points between the nodes too: on a refined mesh nodes may lie far apart. 24 a segment, by eye.
     tau = np.linspace(-1.0, 1.0, 24)
     t = ((breaks[1:] + breaks[:-1])[:, None] + np.diff(breaks)[:, None] * tau).reshape(-1) / 2
     fine = np.concatenate(evaluation(reference, tau) @ pieces)
@@ -37,7 +38,7 @@ def plot_extremal(extremal: Any, units: Units = None) -> Figure:
         ("state", fine[:, :n], states, ""),
         ("costate", fine[:, -n:], states, r"\lambda"),
     )
-    figure, axes = grid(3, 1, 2.1, sharex=True)
+    figure, axes = panel_grid(3, 1, 2.1, sharex=True)
     for axis, (what, values, names, prefix) in zip(axes[:, 0], panels, strict=True):
         for i, name in enumerate(names):
             text = symbol(name) if not prefix else costate_symbol(name)
@@ -53,10 +54,11 @@ def plot_extremal(extremal: Any, units: Units = None) -> Figure:
 
 @styled
 def plot_gains(schedule: Any, units: Units = None) -> Figure:
-    """Gains against time on a symmetric logarithmic scale, and their error estimate below."""
+    """Gains of a GainSchedule against time, on a symmetric logarithmic scale, and the estimate of
+    their error below; gains that are not resolved are marked."""
     states, controls = names_of(schedule.extremal.problem)
     t, K = np.asarray(schedule.times), np.asarray(schedule.K)
-    figure, axes = grid(len(controls) + 1, 1, 2.3, sharex=True)
+    figure, axes = panel_grid(len(controls) + 1, 1, 2.3, sharex=True)
     for i, control in enumerate(controls):
         axis = axes[i, 0]
         for j, state in enumerate(states):
@@ -82,12 +84,13 @@ def plot_gains(schedule: Any, units: Units = None) -> Figure:
 
 @styled
 def plot_flight(flight: Any, extremal: Any, units: Units = None) -> Figure:
-    """States and controls of one Flight over its nominal (left), and their difference (right)."""
+    """States and controls of one Flight and of its nominal (left), and the difference (right; of
+    controls, the command's deviation)."""
     states, controls = names_of(extremal.problem)
     t, x = np.asarray(flight.t), np.asarray(flight.x)
     x_nominal, u_nominal = at(extremal, t)
     u, du = np.asarray(flight.u), np.asarray(flight.commands)
-    figure, axes = grid(len(states) + len(controls), 2, 1.45, sharex=True)
+    figure, axes = panel_grid(len(states) + len(controls), 2, 1.45, sharex=True)
     rows = [(name, x[:, i], x_nominal[:, i], None) for i, name in enumerate(states)]
     rows += [(name, u[:, i], u_nominal[:, i], du[:, i]) for i, name in enumerate(controls)]
     for (left, right), (name, flown, nominal, deviation) in zip(axes, rows, strict=True):
@@ -115,8 +118,8 @@ def plot_deviations(
 ) -> Figure:
     """Deviations from the nominal of several flights (2002 paper, figures 3 to 6).
 
-    **Arguments:** `flights`: a Flight with a leading case axis; `names`: of states (their
-    deviation) or controls (the commanded feedback), a panel each; `labels`: one a case.
+    **Arguments:** `flights`: a Flight with a leading case axis; `names`: of states (their deviation
+    is shown) or controls (the commanded feedback), one panel each; `labels`: one for each case.
 
     **Raises:** `ValueError` for a name that is neither.
     """
@@ -147,8 +150,10 @@ def plot_reoptimised(
     """Flown minus re-optimised states (2002 paper, figures 7 to 9).
 
     **Arguments:** `flights`: a Flight with a leading case axis; `reoptimised` (case, sample+1, n):
-    states, at the same times, of the extremals from the perturbed starts; `names`: of states, a
-    panel each.
+    states, at the same times, of the extremals from the perturbed starts; `names`: of the states
+    shown, one panel each, among `state_names`; `labels`: one for each case.
+
+    **Raises:** `ValueError` for a name that is not a state's.
     """
     states = tuple(state_names)
     off = np.asarray(flights.x) - np.asarray(reoptimised)
@@ -171,10 +176,10 @@ def _cases(
     labels: Sequence[str] | None,
     units: Units,
 ) -> Figure:
-    """A panel for each (times, values by case, text), all with the same cases."""
+    """One panel for each of `panels`: (times, values by case, label); all have the same cases."""
     cases = len(panels[0][1])
     labels = [f"case {k + 1}" for k in range(cases)] if labels is None else labels
-    figure, axes = grid(len(panels), 1, 3.4 if len(panels) == 1 else 2.2, sharex=True)
+    figure, axes = panel_grid(len(panels), 1, 3.4 if len(panels) == 1 else 2.2, sharex=True)
     for axis, (t, values, text) in zip(axes[:, 0], panels, strict=True):
         axis.axhline(0.0, color="#808080", linewidth=0.6)
         for k, (row, text_k) in enumerate(zip(values, labels, strict=True)):
@@ -197,12 +202,13 @@ def plot_gain_errors(
 ) -> Figure:
     """Error of gains against the size of the discretisation, one panel for each time.
 
-    **Arguments:** `errors`: panel title -> method -> (points, errors).
+    **Arguments:** `errors`: (numbers of points, errors) by title of the panel, then by method;
+    `abscissa`, `ordinate`: labels.
     """
-    figure, axes = grid(1, len(errors), 3.0, sharey=True)
+    figure, axes = panel_grid(1, len(errors), 3.0, sharey=True)
     for axis, (title, methods) in zip(axes[0], errors.items(), strict=True):
         for k, (method, (points, values)) in enumerate(methods.items()):
-            values = np.maximum(np.asarray(values, float), 1e-17)
+            values = np.maximum(np.asarray(values, float), 1e-17)  # an error of 0 on a log scale
             axis.loglog(points, values, marker=MARKERS[k], label=method, **line(k))
         axis.set_title(title)
         axis.set_xlabel(abscissa)
@@ -216,8 +222,11 @@ def plot_gain_errors(
 
 
 def at(extremal: Any, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States and controls of an Extremal at `t`, interpolated on the host in the Extremal's own
-    piecewise polynomials: a figure should not cost a compilation."""
+    """States (T, n) and controls (T, m) of an Extremal at the times `t` (T,).
+
+    Interpolated on the host in the Extremal's own piecewise polynomials, since a figure should not
+    cost a compilation.
+    """
     breaks, reference, pieces = _pieces(extremal)
     n, m = extremal.problem.n, extremal.problem.m
     out = np.empty((len(t), n + m))
@@ -230,8 +239,8 @@ def at(extremal: Any, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pieces(extremal: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Breaks, reference nodes, and (x, u, costate) at them, segment by segment, each segment with
-    its own end: control and costate may jump."""
+    """Breaks, reference nodes on [-1, 1], and (x, u, costate) at the nodes of every segment. Each
+    segment has its own values at its end, as control and costate may jump there."""
     reference = np.asarray(extremal.reference_nodes)
     values = np.concatenate([np.asarray(a) for a in (extremal.x, extremal.u, extremal.costate)], 1)
     degree = len(reference) - 1

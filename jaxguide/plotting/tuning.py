@@ -1,4 +1,4 @@
-"""Figures of tuning: the loss, and the design before and after."""
+"""Figures of tuning: the loss against steps, and the design before and after."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,10 +12,11 @@ from jaxguide.plotting.style import COLOURS, MARKERS, WIDTH, line, styled
 
 @styled
 def plot_tuning(tuned: Any, places: Callable[[Any], Mapping[str, Any]] | None = None) -> Figure:
-    """A `jg.tune` run: loss and gradient over its steps, and the design before and after.
+    """A run of `jg.tune`: loss and norm of the gradient against steps, and the design before and
+    after.
 
-    **Arguments:** `tuned`: a Tuned. `places(design)`: name -> places on [0, 1], drawn as ticks;
-    without it every leaf of the design is drawn over its index.
+    **Arguments:** `tuned`: the Tuned that `jg.tune` returns; `places`: from a design to places on
+    [0, 1] by name, drawn as ticks. Without it every leaf of the design is drawn over its index.
     """
     history, best = tuned.history, int(tuned.at)
     draw = _named_leaves if places is None else places

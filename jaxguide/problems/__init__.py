@@ -1,4 +1,4 @@
-"""The library of problems: every problem of the papers, by name. Host only."""
+"""The library of problems, missions and designs, by name. Host only."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -59,7 +59,7 @@ _DESIGNS = {
 
 
 def names() -> tuple[str, ...]:
-    """Every registered name."""
+    """Names of all problems."""
     return tuple(_LIBRARY)
 
 
@@ -78,22 +78,36 @@ def get(name: str) -> "Problem":
 
 
 def describe(name: str) -> str:
-    """One line about the problem."""
+    """The first line of the problem's docstring.
+
+    **Raises:** `UnknownName`, which suggests the nearest name.
+    """
     return (getattr(_module(name), _LIBRARY[name][1]).__doc__ or "").strip().splitlines()[0]
 
 
 def reference(name: str) -> Reference:
-    """What is known of its optimum."""
+    """The known optimum of the problem, and its source.
+
+    **Raises:** `UnknownName`, which suggests the nearest name.
+    """
     return getattr(_module(name), _LIBRARY[name][1]).reference
 
 
 def mission(name: str, **options: Any) -> "Mission":
-    """The problem's own closed loop."""
+    """The problem's own closed loop.
+
+    **Arguments:** `options`: of the `mission` in the problem's module.
+
+    **Raises:** `UnknownName`; `ValueError`, naming the problems that have one, if it has none.
+    """
     return _offered(name, "mission")(**options)
 
 
 def dispersions(name: str) -> dict[str, Any]:
-    """The dispersions its sweep draws by default."""
+    """The dispersions that a sweep of the problem's own closed loop draws by default.
+
+    **Raises:** as `mission`.
+    """
     return _offered(name, "dispersions")()
 
 
@@ -103,7 +117,9 @@ def designs() -> tuple[str, ...]:
 
 
 def design(name: str, **options: Any) -> "Ready":
-    """A design ready to tune, as `jaxguide tune` does.
+    """A design ready to tune, as by `jaxguide tune`.
+
+    **Arguments:** `options`: of the design's own function.
 
     **Raises:** `UnknownName`, which suggests the nearest name.
     """

@@ -10,11 +10,12 @@ from jaxguide.problem import Free, Problem
 from jaxguide.problems.reference import Reference
 from jaxguide.transforms.phased import Phased, PhaseEnds
 
+# Numbers of Benson (2005), section 9.1, and Rao et al. (2010), section 6.3: see `DeltaIII`.
 _RADIUS, _GRAVITY = 6_378_145.0, 3.986012e14  # of the Earth: m, m^3/s^2
 _ROTATION = 7.29211585e-5  # rad/s
 _SCALE_HEIGHT = 7200.0  # of the air, m
 _DRAG_AREA = 0.5 * 4 * np.pi  # drag coefficient times area, m^2
-_LATITUDE = np.deg2rad(28.5)
+_LATITUDE = np.deg2rad(28.5)  # of the pad
 
 # Mass and propellant [kg], thrust [N], burning time [s] of a solid booster and both stages.
 _BOOSTER, _FIRST, _SECOND = (
@@ -22,16 +23,16 @@ _BOOSTER, _FIRST, _SECOND = (
     (104_380.0, 95_550.0, 1_083_100.0, 261.0),
     (19_300.0, 16_820.0, 110_094.0, 700.0),
 )
-_PAYLOAD = 4164.0
+_PAYLOAD = 4164.0  # kg
 # Semi-major axis [m], eccentricity, inclination, node and perigee [rad] of the orbit.
 _ORBIT = (24_361_140.0, 0.7308, *np.deg2rad([28.5, 269.8, 130.5]))
 
 
 class Stage(Problem):
-    """One stage, along a path that ends at `final_time` [s].
+    """One phase of the ascent, until `final_time` [s].
 
     State: position and velocity in inertial axes at the Earth's centre [m, m/s], mass [kg]. The
-    control is the direction of the thrust, of length one at most: at the optimum, of length one.
+    control is the direction of the thrust, a vector of length 1 at most; at the optimum it is 1.
     """
 
     thrust: ArrayLike = 0.0  # N
@@ -41,7 +42,7 @@ class Stage(Problem):
     initial_state: Any = Free()
     state_names = ("x", "y", "z", "vx", "vy", "vz", "m")
     control_names = ("ux", "uy", "uz")
-    control_bounds = (-3.0, 3.0)  # with room: the path constraint limits it
+    control_bounds = (-3.0, 3.0)  # never active: the path constraint limits the control to 1
     path_bounds = (-jnp.inf, 1.0)
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
@@ -49,7 +50,7 @@ class Stage(Problem):
         distance = jnp.sqrt(r @ r)
         wind = jnp.stack([-r[1], r[0], jnp.zeros_like(m)]) * _ROTATION
         through = v - wind
-        speed = jnp.sqrt(through @ through + 1e-6)  # none at the start
+        speed = jnp.sqrt(through @ through + 1e-6)  # 1 mm/s: smooth at the start, where it is 0
         altitude = jnp.maximum(distance - _RADIUS, 0.0)  # guesses may pass below the ground
         density = self.density * jnp.exp(-altitude / _SCALE_HEIGHT)
         drag = -0.5 * density * _DRAG_AREA * speed * through
@@ -61,14 +62,14 @@ class Stage(Problem):
 
 
 class Injection(Stage):
-    """The last stage, until it is in the orbit with the most mass left."""
+    """The last phase: into the target orbit with the most mass left."""
 
     def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
         return -xf[6]
 
     def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
-        # The angular momentum, and the eccentricity's part in its plane: five conditions that stay
-        # smooth where orbital elements do not.
+        # The angular momentum, and the eccentricity vector's two components in the plane of the
+        # orbit: five conditions, smooth also where orbital elements are not.
         momentum, perigee, across = orbit()
         r, v = xf[:3], xf[3:6]
         h = jnp.cross(r, v)
@@ -80,7 +81,8 @@ class Injection(Stage):
 
 
 def orbit() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angular momentum [m^2/s] of the target orbit, unit vectors to its perigee and across."""
+    """The target orbit: angular momentum [m^2/s], unit vector to the perigee, unit vector in the
+    plane across to it."""
     a, e, i, node, argument = _ORBIT
     turn = lambda angle: np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -91,7 +93,8 @@ def orbit() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def staging(ends: tuple[PhaseEnds, ...]) -> Any:
-    """The state goes on, less what is dropped."""
+    """Links of the phases: position and velocity are continuous, and the mass drops by the empty
+    boosters and the empty first stage."""
     dry = lambda part, count: count * (part[0] - part[1])
     dropped = (dry(_BOOSTER, 6), dry(_BOOSTER, 3), dry(_FIRST, 1))
     return jnp.concatenate(
@@ -103,10 +106,10 @@ def staging(ends: tuple[PhaseEnds, ...]) -> Any:
 
 
 class DeltaIII(Phased):
-    """The most mass in a transfer orbit by a Delta III, in four stages: six boosters, three, none,
-    and the second stage.
+    """The most mass in a transfer orbit by a Delta III, in four phases.
 
-    Four phases of `Stage`; at the end of each but the last the mass of what is empty is dropped.
+    The first stage burns with six boosters, with three, and alone; then the second stage. After
+    each phase but the last the empty parts are dropped.
 
     **Source:** D. A. Benson, *A Gauss Pseudospectral Transcription for Optimal Control*, MIT, 2005,
     section 9.1; with the numbers of Rao et al., ACM TOMS 37 (2010), section 6.3, and of Betts,
@@ -122,13 +125,13 @@ class DeltaIII(Phased):
 
 
 def _box(heaviest: float) -> tuple:
-    """State bounds, with room: they tell the units."""
+    """State bounds far from active, from which the solver takes its units."""
     high = (*(2 * _RADIUS,) * 3, *(1.2e4,) * 3, 1.05 * heaviest)
     return (*(-v for v in high[:6]), 1e3), high
 
 
 def stages(density: float = 1.225) -> tuple[Stage, ...]:
-    """The four phases."""
+    """The four phases; `density` [kg/m^3]: of the air on the ground."""
     rate = lambda part: part[1] / part[3]
     on_pad = _PAYLOAD + _SECOND[0] + _FIRST[0] + 9 * _BOOSTER[0]
     start = _RADIUS * np.array([np.cos(_LATITUDE), 0.0, np.sin(_LATITUDE)])

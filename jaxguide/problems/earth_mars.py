@@ -1,4 +1,4 @@
-"""Low-thrust Earth-Mars transfer: the 2002 paper's example, eqs (50)-(56)."""
+"""Low-thrust Earth-Mars transfer: the example of Yan, Fahroo & Ross (2002), eqs. (50)-(56)."""
 
 from typing import Any
 
@@ -20,10 +20,10 @@ from jaxguide.trig import sincos
 class EarthMars(Problem):
     """Reach the largest circular orbit at a fixed time by steering a constant thrust.
 
-    Canonical units (LU, TU): mu = 1, m0 = 1. State r, v_r, v_t; control epsilon, the thrust angle
-    from the local horizontal. J = -r(tf).
+    Canonical units: LU and TU, so that mu = 1, and the initial mass. State r [LU], v_r, v_t
+    [LU/TU]; control epsilon [rad], the angle of the thrust above the local horizontal. J = -r(tf).
 
-    **Source:** Yan, Fahroo & Ross (2002), eqs (50)-(56), after Bryson & Ho (1975).
+    **Source:** Yan, Fahroo & Ross (2002), eqs. (50)-(56), after Bryson & Ho (1975).
     """
 
     thrust: ArrayLike = 0.1405
@@ -42,6 +42,7 @@ class EarthMars(Problem):
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         r, v_r, v_t = x[0], x[1], x[2]
         sin, cos = sincos(u[0])
+        # Equations of the 2002 paper.
         a = self.thrust / (self.mass - self.mass_flow * t)  # eq. (53)
         return jnp.stack(
             [
@@ -61,12 +62,16 @@ class EarthMars(Problem):
         return jnp.arctan2(-costate[1], -costate[2])[None]
 
 
-SAMPLE_INTERVAL = 0.02  # TU, section 5
-CAP = 0.3  # rad, bound on |du| in dispersed flights
+SAMPLE_INTERVAL = 0.02  # TU: 2002 paper, section 5
+CAP = 0.3  # rad, bound of |du| in dispersed flights: chosen, as the paper has none
 
 
 def mission(extremal: Extremal | None = None, cap: float = CAP, **options: Any) -> Mission:
-    """The paper's closed loop: exact gains sampled every 0.02 TU, du held over the sample."""
+    """The 2002 paper's closed loop: exact gains sampled every 0.02 TU, du held over the sample.
+
+    **Arguments:** `extremal`: the nominal, solved for if absent; `cap` [rad]: bound of |du|;
+    `options`: of `jg.Mission`.
+    """
     extremal = solve(EarthMars()) if extremal is None else extremal
     tf = float(extremal.final_time)
     count = round(tf / SAMPLE_INTERVAL)
@@ -76,5 +81,6 @@ def mission(extremal: Extremal | None = None, cap: float = CAP, **options: Any) 
 
 
 def dispersions() -> dict[str, Distribution]:
-    """Table 1's deviations as one-sigma values, about a third of its largest."""
+    """The initial state dispersed by 1e-3 in each component, one sigma: about a third of the
+    largest deviation in the 2002 paper, Table 1."""
     return {"initial_state": Normal(1e-3)}

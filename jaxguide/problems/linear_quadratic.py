@@ -1,4 +1,8 @@
-"""Problems with linear dynamics and quadratic cost, some under state constraints; closed forms."""
+"""Problems with linear dynamics and linear or quadratic cost, some with state constraints: nearly
+all with an optimum in closed form.
+
+Without units. Constants are those of each problem's `reference.source`.
+"""
 
 from typing import Any
 
@@ -59,7 +63,7 @@ class BrysonDenham(Problem):
 
 
 class Beam(BrysonDenham):
-    """As Bryson-Denham with x <= 0.1, |u| <= 10 and J = int u^2."""
+    """The Bryson-Denham problem with x <= 0.1, |u| <= 10 and J = int u^2."""
 
     state_bounds = ((-jnp.inf, -jnp.inf), (0.1, jnp.inf))
     control_bounds = (-10.0, 10.0)
@@ -130,7 +134,7 @@ class TwoThrusters(Problem):
 class Robbins(Problem):
     """x''' = u from (1, -2, 0) to rest at 0 in 10 with x >= 0, J = int 3 x + u^2/2.
 
-    A third-order state constraint, touched infinitely often.
+    A state constraint of third order: the optimum touches it infinitely often.
     """
 
     weight: ArrayLike = 3.0

@@ -1,4 +1,4 @@
-"""Launch from the Moon into a low orbit in least time: Libby's thesis, chapter 4."""
+"""Launch from the Moon into a low orbit in the least time: Libby's thesis, chapter 4."""
 
 from typing import Any
 
@@ -23,12 +23,12 @@ from jaxguide.trig import sincos
 class LunarLaunch(Problem):
     """Least time from rest to 50,000 ft at 5,444 ft/s, level, by steering a constant thrust.
 
-    Flat Moon, uniform gravity; feet and seconds. State x, y, u, v (downrange, altitude and their
-    rates); control theta, the thrust angle above the horizontal. J = tf. The optimum is the linear
-    tangent law, tan(theta) = 0.48782613 - 0.00159492555 t.
+    Flat Moon, uniform gravity. State x, y [ft] (downrange, altitude), u, v [ft/s] (their rates);
+    control theta [rad], the angle of the thrust above the horizontal. J = tf [s]. The optimum is
+    the linear tangent law, tan(theta) = 0.48782613 - 0.00159492555 t.
 
     **Source:** W. A. Libby, *Neighboring Extremal Guidance for Systems with Piecewise Linear
-    Control Using Time as the Reference Variable*, University of Texas, eqs (4.1)-(4.9).
+    Control Using Time as the Reference Variable*, University of Texas, eqs. (4.1)-(4.9).
     """
 
     thrust: ArrayLike = 20.8  # acceleration, ft/s^2
@@ -55,10 +55,12 @@ class LunarLaunch(Problem):
         return jnp.arctan2(-costate[3], -costate[2])[None]
 
 
-SAMPLE_INTERVAL = 4.0  # s, section 4.5
-POWERS = (0.0, 2.0, 1.0, 1.0)  # x does not matter, y is a position, u and v are velocities
-QUIET = 1.0  # s, in which the correction is no longer updated
-MISS = (100.0, 2.0, 10.0)  # ft, ft/s, ft/s: further off than this is no orbit
+SAMPLE_INTERVAL = 4.0  # s: thesis, section 4.5
+# Powers of the time to go by which gains grow: 2 of a position (y), 1 of a velocity (u, v), 0 of x,
+# which has no gain.
+POWERS = (0.0, 2.0, 1.0, 1.0)
+QUIET = 1.0  # s before the end in which the correction is not updated (chosen)
+MISS = (100.0, 2.0, 10.0)  # ft, ft/s, ft/s of y, u, v: further off, a flight has failed (chosen)
 
 
 def mission(
@@ -68,10 +70,14 @@ def mission(
     quiet: float = QUIET,
     **options: Any,
 ) -> Mission:
-    """Closed loop with the time to go as reference, sampled every 4 s, one RK4 step each.
+    """Closed loop with the time to go as reference, sampled every 4 s, one Runge-Kutta step each.
 
-    As it comes: exact gains, scaled by the time to go; the correction rests in the last second.
-    The thesis's: `form="whole", interpolation=LinearGains(), quiet=0.0, miss=None`.
+    By default with exact gains, interpolated scaled by the time to go, and the correction held in
+    the last second. The thesis's own law is `form="whole", interpolation=LinearGains(), quiet=0.0,
+    miss=None`.
+
+    **Arguments:** `extremal`: the nominal, solved for if absent; `form`: of `jg.suboptimal_gains`;
+    `interpolation`, `quiet` [s]: of `jg.TimeToGo`; `options`: of `jg.Mission`.
     """
     extremal = solve(LunarLaunch(), PiecewiseLinear()) if extremal is None else extremal
     interpolation = TimeToGoGains(jnp.asarray(POWERS)) if interpolation is None else interpolation
@@ -81,7 +87,8 @@ def mission(
 
 
 def dispersions() -> dict[str, Distribution]:
-    """Thrust and gravity by 1 per cent, one sigma; 100 ft and 10 ft/s at the start."""
+    """Thrust and gravity dispersed by 1 per cent, the initial position by 100 ft and the velocity
+    by 10 ft/s in each component, one sigma (chosen)."""
     return {
         "plant.thrust": Normal(0.208),
         "plant.gravity": Normal(0.0532),

@@ -1,4 +1,5 @@
-"""NPSAT1, a magnetically steered small satellite, on its air bearing: the 2006 paper's example."""
+"""NPSAT1, a small satellite steered by magnets, on an air bearing: the example of Ross, Sekhavat,
+Fleming & Gong (2006)."""
 
 from typing import Any
 
@@ -14,14 +15,14 @@ _HALF = jnp.pi * 135 / 360  # half the slew angle: 135 degrees about the vertica
 class NPSAT1(Problem):
     """Turn a satellite on an air bearing by 135 degrees, rest to rest, in the least time.
 
-    Quaternion q1 ... q4 (scalar last) and body rates omega [rad/s]; controls are the dipole
-    moments u [A m^2] of three magnetic torquers. The mass hangs below the bearing's centre: a
-    pendulum of `weight_moment` [N m], some 250 times what the magnets can do. J = tf [s].
+    State: quaternion q1 ... q4 (scalar last) and body rates omega [rad/s]; controls: dipole moments
+    u [A m^2] of three magnetic torquers. The mass hangs below the bearing's centre: a pendulum of
+    `weight_moment` [N m], some 250 times the torque of the magnets. J = tf [s].
 
-    The final q4 follows from |q| = 1, which the dynamics keep. Bounds on q and omega hold with
-    room to spare; they tell the units.
+    The final q4 follows from |q| = 1, which the dynamics keep. Bounds of q and omega are far from
+    active; the solver takes its units from them.
 
-    **Source:** Ross, Sekhavat, Fleming & Gong (2006), eqs (31)-(38), magnetic field in tesla.
+    **Source:** Ross, Sekhavat, Fleming & Gong (2006), eqs. (31)-(38), magnetic field in tesla.
     """
 
     inertia: tuple = (2.60, 2.87, 1.45)  # kg m^2

@@ -1,4 +1,7 @@
-"""Oscillators and other nonlinear regulators, with boundary layers, singular arcs, chattering."""
+"""Oscillators and other nonlinear regulators: boundary layers, singular arcs, chattering.
+
+Without units. Constants are those of each problem's `reference.source`.
+"""
 
 from typing import Any
 

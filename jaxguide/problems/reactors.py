@@ -1,4 +1,7 @@
-"""Chemical reactors and a tumour: bang-singular controls."""
+"""Chemical reactors and a tumour: controls with arcs at a bound and singular arcs.
+
+Constants are those of each problem's `reference.source`.
+"""
 
 from typing import Any
 
@@ -49,11 +52,15 @@ class Jackson(Problem):
         return -xf[2]
 
 
-_CAPACITY = ((5.85 - 0.02) / 0.00873) ** 1.5
+_CAPACITY = ((5.85 - 0.02) / 0.00873) ** 1.5  # volume at which p and q rest without treatment
 
 
 class Tumour(Problem):
-    """Anti-angiogenic treatment with a bounded total dose: the smallest final tumour."""
+    """Anti-angiogenic treatment with a bounded total dose: the smallest final tumour.
+
+    State: tumour volume p, its vascular capacity q [mm^3], dose given; control: dose rate;
+    time in days.
+    """
 
     growth: Any = 0.084
     state_names = ("p", "q", "dose")

@@ -16,18 +16,18 @@ _DEGREE = math.pi / 180
 class ShuttleReentry(Problem):
     """From 260,000 ft to 80,000 ft with the greatest final latitude.
 
-    State: altitude [ft], longitude, latitude [rad], speed [ft/s], flight path, azimuth [rad];
-    control: angle of attack, bank [rad].
+    State: altitude [ft], longitude, latitude [rad], speed [ft/s], flight path angle, azimuth [rad];
+    controls: angle of attack, bank [rad].
 
-    **Source:** Betts, Practical Methods for Optimal Control (2010), example 6.1.
+    **Source:** Betts, *Practical Methods for Optimal Control* (2010), example 6.1.
     """
 
     mass: ArrayLike = 203000.0 / 32.174  # slug
-    mu: ArrayLike = 0.14076539e17
-    earth: ArrayLike = 20902900.0
-    density: ArrayLike = 0.002378
-    scale_height: ArrayLike = 23800.0
-    area: ArrayLike = 2690.0
+    mu: ArrayLike = 0.14076539e17  # ft^3/s^2
+    earth: ArrayLike = 20902900.0  # radius, ft
+    density: ArrayLike = 0.002378  # of the air on the ground, slug/ft^3
+    scale_height: ArrayLike = 23800.0  # ft
+    area: ArrayLike = 2690.0  # of reference, ft^2
     state_names = ("h", "phi", "theta", "v", "gamma", "psi")
     control_names = ("alpha", "beta")
     initial_state = (260000.0, 0.0, 0.0, 25600.0, -_DEGREE, 90 * _DEGREE)
@@ -72,7 +72,10 @@ class ShuttleReentry(Problem):
 
 
 class ShuttleReentryHeat(ShuttleReentry):
-    """As above with the leading edge heated by at most 70 BTU/ft^2/s."""
+    """Shuttle re-entry with the leading edge heated by at most 70 BTU/ft^2/s.
+
+    **Source:** Betts, *Practical Methods for Optimal Control* (2010), example 6.2.
+    """
 
     path_bounds = (-math.inf, 70.0)
     reference = Reference(-0.534515, 2e-6, "independent, two meshes", "Betts example 6.2; dymos")

@@ -1,4 +1,7 @@
-"""Brachistochrones and other steering problems."""
+"""Brachistochrones and other steering problems, and two with integral constraints.
+
+Angles in radians, else without units. Constants are those of each problem's `reference.source`.
+"""
 
 from typing import Any
 
@@ -80,7 +83,7 @@ class LinearTangentSteering(Problem):
 
 
 class HangingChain(Problem):
-    """The chain of length 4 from height 1 to height 3 over unit span: least potential energy."""
+    """A chain of length 4 from height 1 to height 3 over unit span: the least potential energy."""
 
     state_names = ("x",)
     control_names = ("slope",)
@@ -102,7 +105,10 @@ class HangingChain(Problem):
 
 
 class Isoperimetric(Problem):
-    """The closed curve of unit length around the largest area: 1/(4 pi), by arc length."""
+    """The closed curve of unit length around the largest area, 1/(4 pi).
+
+    "Time" is arc length; its centre is at the origin.
+    """
 
     state_names = ("x", "y")
     control_names = ("t_x", "t_y")

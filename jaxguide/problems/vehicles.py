@@ -1,4 +1,4 @@
-"""Rockets, robots and gliders."""
+"""Rockets, robots and gliders. Constants are those of each problem's `reference.source`."""
 
 from typing import Any
 
@@ -101,7 +101,7 @@ class RobotArm(Problem):
 
 
 class FreeFlyingRobot(Problem):
-    """Two pairs of thrusters bring a robot to rest at the origin in 12 with the least fuel."""
+    """Two pairs of thrusters bring a robot to rest at the origin in 12 on the least fuel."""
 
     arm: ArrayLike = 0.2
     state_names = ("x", "y", "theta", "v_x", "v_y", "omega")
@@ -132,14 +132,17 @@ class FreeFlyingRobot(Problem):
 
 
 class HangGlider(Problem):
-    """A hang glider crosses a thermal: the longest range on the way from 1000 m to 900 m."""
+    """A hang glider crosses a thermal: the longest range on the way from 1000 m to 900 m.
 
-    mass: ArrayLike = 100.0
-    gravity: ArrayLike = 9.80665
-    area: ArrayLike = 14.0
-    density: ArrayLike = 1.13
-    updraft: ArrayLike = 2.5
-    radius: ArrayLike = 100.0
+    State: range, altitude [m], and their rates [m/s]; control: lift coefficient. J = -x(tf).
+    """
+
+    mass: ArrayLike = 100.0  # kg
+    gravity: ArrayLike = 9.80665  # m/s^2
+    area: ArrayLike = 14.0  # of the wing, m^2
+    density: ArrayLike = 1.13  # of the air, kg/m^3
+    updraft: ArrayLike = 2.5  # at the thermal's centre, m/s
+    radius: ArrayLike = 100.0  # of the thermal, m
     state_names = ("x", "y", "v_x", "v_y")
     control_names = ("c_L",)
     initial_state = (0.0, 1000.0, 13.2275675, -1.28750052)

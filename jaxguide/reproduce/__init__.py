@@ -1,4 +1,4 @@
-"""Published results, computed beside printed: one file each, imported when asked for.
+"""Published results, computed values beside printed ones: one folder each, imported on demand.
 
 Each module has `run(out: Path | None, progress: Progress | None) -> Report`.
 """

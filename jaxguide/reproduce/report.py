@@ -1,4 +1,4 @@
-"""What a reproduction found: rows of computed values beside reference and printed ones.
+"""The report of a reproduction: rows of computed values beside reference and printed ones.
 
 Host-side; light to import.
 """
@@ -22,11 +22,11 @@ class Row:
 
         |computed - reference| <= max(tolerance, relative |reference|).
 
-    Otherwise it informs only. The printed value is shown, never judged: a paper may be wrong.
+    Otherwise it is shown only. The printed value is never judged: a paper may be wrong.
 
     **Arguments:**
 
-    - `name`: what it is.
+    - `name`: of the number.
     - `computed`: the value found here.
     - `reference`: an independent value held to be true.
     - `printed`: the value in the publication.
@@ -52,6 +52,7 @@ class Row:
 
     @property
     def judged(self) -> bool:
+        """Whether there is a reference, and a tolerance to hold the value to."""
         has_tolerance = self.tolerance is not None or self.relative is not None
         return self.reference is not None and has_tolerance
 
@@ -70,12 +71,14 @@ class Row:
 
     @property
     def passed(self) -> bool:
+        """Whether the value is within its tolerance; true of a row that is not judged."""
         deviation, allowed = self.deviation, self.allowed
         if deviation is None or allowed is None:
             return True
         return abs(deviation) <= allowed  # false for NaN
 
     def to_dict(self) -> dict[str, Any]:
+        """Fields and judgement, for JSON."""
         computed = {key: getattr(self, key) for key in ("deviation", "allowed", "judged", "passed")}
         return jsonable(dataclasses.asdict(self) | computed)
 
@@ -96,9 +99,11 @@ class Section:
 
     @property
     def passed(self) -> bool:
+        """Whether every row passes."""
         return all(row.passed for row in self.rows)
 
     def to_dict(self) -> dict[str, Any]:
+        """Title, text and rows, for JSON."""
         rows = [row.to_dict() for row in self.rows]
         return {"title": self.title, "text": self.text, "passed": self.passed, "rows": rows}
 
@@ -131,7 +136,7 @@ class Section:
 class Report:
     """A reproduction: sections of rows, the figures written, and seconds spent by stage.
 
-    `extra` takes anything more worth keeping; it is in the JSON only.
+    `extra` holds anything else worth keeping; it is in the JSON only.
     """
 
     title: str
@@ -147,6 +152,7 @@ class Report:
 
     @property
     def rows(self) -> list[Row]:
+        """The rows of all sections."""
         return [row for section in self.sections for row in section.rows]
 
     @property
@@ -156,7 +162,7 @@ class Report:
         return len(judged) > 0 and all(row.passed for row in judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: plain numbers, and null for what is not finite."""
+        """For JSON: plain numbers, and null for NaN and infinities."""
         return jsonable(
             {
                 "title": self.title,
@@ -181,6 +187,7 @@ class Report:
         return Group(*parts)
 
     def print(self, console: Console | None = None) -> None:
+        """Prints the report as tables."""
         console = console or Console()
         if not console.is_terminal:
             console.width = max(console.width, 120)  # a file need not be 80 columns wide

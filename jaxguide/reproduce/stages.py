@@ -9,7 +9,11 @@ from jaxguide.reproduce.report import Report
 
 
 class Stages:
-    """Names, times and shows the stages of a reproduction."""
+    """Names, times and shows the stages of a reproduction.
+
+    **Arguments:** `report`: its `timings` are filled in; `progress`: shows the share done;
+    `count`: number of stages.
+    """
 
     def __init__(self, report: Report, progress: Progress, count: int):
         self.report, self.progress, self.count, self.done = report, progress, count, 0
@@ -17,6 +21,7 @@ class Stages:
 
     @contextlib.contextmanager
     def __call__(self, name: str) -> Iterator[None]:
+        """One stage: a context that times its body."""
         began = time.perf_counter()
         yield
         self.report.timings[name] = time.perf_counter() - began
@@ -24,4 +29,5 @@ class Stages:
         self.state = self.progress.step(self.state, self.done / self.count)
 
     def close(self) -> None:
+        """Ends the display."""
         self.progress.close(self.state)

@@ -3,6 +3,9 @@
 from jaxguide.spectral.barycentric import barycentric_weights as barycentric_weights
 from jaxguide.spectral.barycentric import differentiation_matrix as differentiation_matrix
 from jaxguide.spectral.barycentric import interpolation_matrix as interpolation_matrix
+from jaxguide.spectral.families import FAMILIES as FAMILIES
+from jaxguide.spectral.families import NodeFamily as NodeFamily
+from jaxguide.spectral.families import node_family as node_family
 from jaxguide.spectral.grids import Grid as Grid
 from jaxguide.spectral.grids import grid as grid
 from jaxguide.spectral.interpolation import interpolate as interpolate

@@ -26,9 +26,9 @@ def as_nodes(x: Float[Real, " n"], least: int = 1) -> Float[Array, " n"]:
 
 
 def like(value, reference) -> Array:
-    """`value` as a JAX array; if on the host, in the dtype of `reference` if that is a JAX array.
+    """`value` as a JAX array; a host constant takes the dtype of `reference`, if that is one.
 
-    So host constants follow the arrays they meet, and arrays are never cast.
+    So host constants follow the arrays that they are combined with, and arrays are never cast.
     """
     if isinstance(value, jax.Array) or not isinstance(reference, jax.Array):
         return jnp.asarray(value)

@@ -1,27 +1,21 @@
 """Standard grids with their matrices: host-side NumPy constants, cached, for use under `jit`."""
 
 import functools as ft
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxguide.spectral.nodes import Nodes, nodes_cgl, nodes_lg, nodes_lgl, nodes_lgr
-
-FAMILIES: dict[str, Callable[[int], Nodes]] = {
-    "lg": nodes_lg,
-    "lgl": nodes_lgl,
-    "cgl": nodes_cgl,
-    "lgr-left": lambda n: nodes_lgr(n, "left"),
-    "lgr-right": lambda n: nodes_lgr(n, "right"),
-}
+from jaxguide.spectral.families import NodeFamily, checked_nodes, node_family
+from jaxguide.spectral.nodes import nodes_lg
 
 
 class Grid(NamedTuple):
-    """A family's constants, read-only float64, tau on [-1, 1] dimensionless.
+    """Constants of n nodes of a family, read-only float64; tau on [-1, 1], dimensionless.
 
-    `differentiation` and `integration` (from -1) are the matrices of `matrices.py`; `ends` (2, n)
-    evaluates the interpolant at -1 and +1.
+    - `x`, `w` (n,): nodes and quadrature weights.
+    - `differentiation`, `integration` (n, n): as `differentiation_matrix` and `integration_matrix`
+      from -1.
+    - `ends` (2, n): evaluates the interpolant at -1 and +1.
     """
 
     x: np.ndarray
@@ -32,25 +26,25 @@ class Grid(NamedTuple):
 
 
 @ft.cache
-def grid(family: str, n: int) -> Grid:
+def grid(family: str | NodeFamily, n: int) -> Grid:
     """Nodes, weights and matrices of `n` points.
 
     Written in NumPy beside the JAX versions (tests hold them equal) so that the constants are
     float64 whatever JAX is set to, and are no part of the compiled program.
 
-    **Arguments:** `family`: "lg", "lgl", "cgl", "lgr-left" or "lgr-right"; `n`: number of points.
+    **Arguments:** `family`: "lg", "lgl", "cgl", "lgr-left", "lgr-right" or a `NodeFamily`; `n`:
+    number of points.
 
     **Returns:** a `Grid`; cast it to the dtype in use.
 
-    **Error:** as `differentiation_matrix` and `integration_matrix`.
+    **Error:** that of `differentiation_matrix` and `integration_matrix`.
 
-    **Raises:** `ValueError` for another family or too few points.
+    **Raises:** `ValueError` for another family, too few points, or nodes that break the contract
+    of `NodeFamily`.
 
-    **Source:** as the functions named.
+    **Source:** that of `differentiation_matrix` and `integration_matrix`.
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}.")
-    x, w = FAMILIES[family](n)
+    x, w = checked_nodes(node_family(family), n)
     weights = capacity_weights(x)
     d = differentiation(x, weights)
 
@@ -67,13 +61,23 @@ def grid(family: str, n: int) -> Grid:
 
 
 def capacity_weights(x: np.ndarray) -> np.ndarray:
-    """Barycentric weights: 2 is the inverse capacity of [-1, 1]; in this order of factors float64
-    holds past n = 512."""
+    """Barycentric weights (n,) of distinct nodes on [-1, 1], in NumPy.
+
+    Factors are scaled by 2, the inverse capacity of [-1, 1]; in this order their products stay
+    within float64 past n = 512.
+
+    **Source:** Berrut & Trefethen, SIAM Review 46 (2004), eq. (3.2) and section 7.
+    """
     return 1 / np.prod((x[:, None] - x[None, :] + np.eye(len(x)) / 2) * 2, axis=1)
 
 
 def differentiation(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """The differentiation matrix of any distinct nodes, in NumPy."""
+    """The differentiation matrix (n, n) of distinct nodes `x`, in NumPy.
+
+    **Arguments:** `weights`: barycentric weights of `x`, if at hand.
+
+    **Error, Source:** that of `differentiation_matrix`.
+    """
     weights = capacity_weights(x) if weights is None else weights
     eye = np.eye(len(x))
     d = (weights[None, :] / weights[:, None] - eye) / (x[:, None] - x[None, :] + eye)
@@ -81,7 +85,12 @@ def differentiation(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
 
 
 def evaluation(x: np.ndarray, query: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Matrix of the interpolant through any distinct nodes `x`, at `query`, in NumPy."""
+    """Matrix (q, n) that evaluates the interpolant through distinct nodes `x` at `query`, in NumPy.
+
+    **Arguments:** `weights`: barycentric weights of `x`, if at hand.
+
+    **Error, Source:** that of `interpolation_matrix`.
+    """
     weights = capacity_weights(x) if weights is None else weights
     dx = query[:, None] - x[None, :]
     hit = dx == 0

@@ -47,8 +47,8 @@ def interpolate_piecewise(
 ) -> Float[Array, "*shape"]:
     """A piecewise polynomial at `t`.
 
-    Right-continuous: at an inner break the later segment speaks. Segments of zero length never do.
-    Before the first break and after the last, the value there is held.
+    Right-continuous: at an inner break the later segment's value counts. Segments of zero length
+    are skipped. Before the first break and after the last, the value there is held.
 
     **Arguments:** `breaks`: ends of the segments, ascending, repeats allowed; `values`: at the
     reference `nodes` of each segment; `t`: in the unit of `breaks`; `nodes`: on [-1, 1], the same
@@ -78,7 +78,8 @@ def interpolate_piecewise(
     first, last = breaks[0], breaks[-1]
     # Not jnp.clip: its derivative at the ends is 1/2 or 0.
     t = jnp.where(t < first, first, jnp.where(t > last, last, t))
-    # Few segments: comparing with all is quicker than a search loop, above all under vmap.
+    # There are few segments, so comparing with all is quicker than a search loop, above all under
+    # vmap.
     after = jnp.searchsorted(breaks, t, side="right", method="compare_all")
     end = jnp.searchsorted(breaks, last, side="left", method="compare_all")
     i = jnp.maximum(jnp.minimum(after, end) - 1, 0)

@@ -1,4 +1,4 @@
-r"""Domain transformations $\Gamma$ between computational $\tau$ and time $t$."""
+r"""Domain transformations $\Gamma$ between the computational domain $\tau$ and time $t$."""
 
 import abc
 
@@ -13,7 +13,11 @@ Numbers = Float[Real, "*shape"] | float | int
 
 
 class AbstractMap(eqx.Module):
-    """An increasing map from tau on [-1, 1] or [-1, 1) to time."""
+    """An increasing map from tau on [-1, 1] or [-1, 1) to time.
+
+    A map is a pytree of its fields; every method takes numbers or arrays of any shape, returns that
+    shape, and is differentiable.
+    """
 
     @abc.abstractmethod
     def __call__(self, tau: Numbers) -> Float[Array, "*shape"]:

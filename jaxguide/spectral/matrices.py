@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-# The unweighted matrix lives with the formula it shares with interpolation; it belongs here too.
+# The plain matrix is defined beside the barycentric formula, and is offered here with the others.
 from jaxguide.spectral.barycentric import Real, as_nodes, interpolation_matrix, like
 from jaxguide.spectral.barycentric import barycentric_weights as barycentric_weights
 from jaxguide.spectral.barycentric import differentiation_matrix as differentiation_matrix

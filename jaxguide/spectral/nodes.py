@@ -1,11 +1,15 @@
-"""Nodes and quadrature weights on [-1, 1]. Host-side NumPy, cached: `n` fixes every shape."""
+"""Nodes and quadrature weights on [-1, 1]. Host-side NumPy, cached: `n` fixes every shape.
+
+Zeros of Legendre polynomials are found by Newton's method in the angle theta = arccos x, each of
+them on its own (`_newton`).
+"""
 
 import functools as ft
 from collections.abc import Callable
 
 import numpy as np
 
-Nodes = tuple[np.ndarray, np.ndarray]
+Nodes = tuple[np.ndarray, np.ndarray]  # positions and quadrature weights
 
 
 @ft.cache
@@ -177,7 +181,14 @@ def _radau(n: int, theta: np.ndarray, sign: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _newton(step: Callable[[np.ndarray], np.ndarray], theta: np.ndarray) -> np.ndarray:
-    # The asymptotic guesses are good to 1e-2 relative or better: five steps reach rounding.
+    """Zeros near the asymptotic guesses `theta`, by `step`, Newton's correction of each.
+
+    By hand and in NumPy: `n` is static and the nodes are constants, so nothing here is traced or
+    differentiated, and a root finder of JAX would compile a program for each n to do 0.02 s of work
+    at n = 512. Scalar zeros with guesses this good need neither safeguard nor stopping rule.
+    """
+    # The guesses are good to 1e-2 relative or better, and errors square with each step: four reach
+    # rounding, the fifth is to spare. Tests compare the nodes with 30 digits.
     for _ in range(5):
         theta = theta + step(theta)
     return theta

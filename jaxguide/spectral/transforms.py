@@ -1,6 +1,6 @@
 r"""Values at nodes to Legendre or Chebyshev coefficients, and back.
 
-Coefficients that stop falling ("the spectral tail") say that a grid is too coarse.
+Coefficients that stop falling (a high "spectral tail") show that a grid is too coarse.
 """
 
 import functools as ft
@@ -34,7 +34,13 @@ def legendre_vandermonde(x: Float[Real, " q"], n: int) -> Float[Array, "q n"]:
 def chebyshev_vandermonde(x: Float[Real, " q"], n: int) -> Float[Array, "q n"]:
     r"""$V_{ik} = T_k(x_i)$, k = 0 ... n - 1.
 
-    **Arguments, Returns, Error, Raises:** as `legendre_vandermonde`.
+    **Arguments:** `x`: points on [-1, 1]; `n`: number of polynomials, at least 1.
+
+    **Returns:** `V`, dimensionless; differentiable in `x`.
+
+    **Error:** at most $n \epsilon$ in the interior, $n^2 \epsilon$ beside the ends.
+
+    **Raises:** `ValueError` if `n < 1`.
 
     **Source:** Abramowitz & Stegun (1964), eq. 22.7.4.
     """
@@ -65,8 +71,15 @@ def legendre_matrix(x: Float[Real, " n"]) -> Float[Array, "n n"]:
 def chebyshev_matrix(x: Float[Real, " n"]) -> Float[Array, "n n"]:
     r"""Matrix from values at the nodes to the Chebyshev coefficients of their interpolant.
 
-    **Arguments, Returns, Error, Raises:** as `legendre_matrix`; the quadrature is at the n zeros
-    of $T_n$.
+    By Gauss-Chebyshev quadrature of the interpolant at the n zeros of $T_n$.
+
+    **Arguments:** `x`: distinct nodes on [-1, 1] (LGL, LG, LGR, CGL or any other).
+
+    **Returns:** the matrix, dimensionless; differentiable in `x`.
+
+    **Error:** about $n \epsilon$ times the Lebesgue constant of the nodes.
+
+    **Raises:** `ValueError` if known nodes coincide.
 
     **Source:** Canuto et al., Spectral Methods: Single Domains (2006), section 2.4.
     """
@@ -77,7 +90,10 @@ def chebyshev_matrix(x: Float[Real, " n"]) -> Float[Array, "n n"]:
 def legendre_coefficients(
     x: Float[Real, " n"], values: Float[Real, " n *shape"]
 ) -> Float[Array, " n *shape"]:
-    """Legendre coefficients of the interpolant of `values` at `x`; see `legendre_matrix`."""
+    """Legendre coefficients of the interpolant of `values` at the distinct nodes `x`.
+
+    **Error, Raises:** of `legendre_matrix`, which this applies.
+    """
     m = legendre_matrix(like(x, values))
     return _apply(m, like(values, m))
 
@@ -85,7 +101,10 @@ def legendre_coefficients(
 def chebyshev_coefficients(
     x: Float[Real, " n"], values: Float[Real, " n *shape"]
 ) -> Float[Array, " n *shape"]:
-    """Chebyshev coefficients of the interpolant of `values` at `x`; see `chebyshev_matrix`."""
+    """Chebyshev coefficients of the interpolant of `values` at the distinct nodes `x`.
+
+    **Error, Raises:** of `chebyshev_matrix`, which this applies.
+    """
     m = chebyshev_matrix(like(x, values))
     return _apply(m, like(values, m))
 
@@ -93,7 +112,8 @@ def chebyshev_coefficients(
 def legendre_values(
     x: Float[Real, " q"], coefficients: Float[Real, " n *shape"]
 ) -> Float[Array, " q *shape"]:
-    """Sum of the Legendre series at `x`: the inverse of `legendre_coefficients`."""
+    """Sum of the Legendre series with `coefficients` at the points `x`: the inverse of
+    `legendre_coefficients`."""
     v = legendre_vandermonde(like(x, coefficients), coefficients.shape[0])
     return _apply(v, like(coefficients, v))
 
@@ -101,7 +121,8 @@ def legendre_values(
 def chebyshev_values(
     x: Float[Real, " q"], coefficients: Float[Real, " n *shape"]
 ) -> Float[Array, " q *shape"]:
-    """Sum of the Chebyshev series at `x`: the inverse of `chebyshev_coefficients`."""
+    """Sum of the Chebyshev series with `coefficients` at the points `x`: the inverse of
+    `chebyshev_coefficients`."""
     v = chebyshev_vandermonde(like(x, coefficients), coefficients.shape[0])
     return _apply(v, like(coefficients, v))
 

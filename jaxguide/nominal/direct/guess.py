@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import bounds_of
 from jaxguide.conditions.units import REST, known_size, natural_units
-from jaxguide.linalg import solve as small_solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
 from jaxguide.problem import (
@@ -129,7 +129,7 @@ def _nearest_ends(program: Transcription, t0: Array, tf: Array) -> tuple[Array, 
         size = jnp.linalg.norm(J, axis=1)
         size = jnp.where(size > 0, size, 1.0)
         miss, J = (e - jnp.clip(e, e_lo, e_hi)) / size, J / size[:, None]
-        step = J.T @ small_solve(J @ J.T + _RIDGE * q * jnp.eye(q, dtype=dtype), miss)
+        step = J.T @ gauss_solve(J @ J.T + _RIDGE * q * jnp.eye(q, dtype=dtype), miss)
         step = jnp.where(jnp.isfinite(step), step, 0.0)
         return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
 

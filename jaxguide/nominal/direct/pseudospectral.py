@@ -17,7 +17,7 @@ from jaxguide.host.lapack import single_threaded_lapack
 from jaxguide.host.memory import physical_memory
 from jaxguide.nominal.defects import segment_errors
 from jaxguide.nominal.direct import interior_point
-from jaxguide.nominal.direct.collocation import FAMILIES, collocation
+from jaxguide.nominal.direct.collocation import collocation
 from jaxguide.nominal.direct.covectors import to_extremal
 from jaxguide.nominal.direct.guess import edges, from_extremal, random_guess, straight_guess
 from jaxguide.nominal.direct.implicit import sensitivity
@@ -29,6 +29,7 @@ from jaxguide.nominal.direct.warm import blank_duals, duals, fits
 from jaxguide.nominal.guesses import is_key
 from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
+from jaxguide.spectral import NodeFamily, node_family
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import Endless
 from jaxguide.transforms.integrals import with_integrals
@@ -50,7 +51,8 @@ class Pseudospectral(Method):
     **Arguments:**
 
     - `grid`: "lgl" (the review's choice; for one segment: on many, its two equations at each
-      shared node cost accuracy), "cgl", "lgr-left", "lgr-right" (default) or "lg".
+      shared node cost accuracy), "cgl", "lgr-left", "lgr-right" (default), "lg", or a
+      `jg.NodeFamily` of your own.
     - `nodes`: collocation nodes a segment. `segments`: how many, of equal length; or instead
       `fractions`, the break points of the horizon from 0 to 1. `knots`: which of the inner ones
       (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
@@ -83,7 +85,7 @@ class Pseudospectral(Method):
     **Source:** review, eqs (10)-(16), (21), (23); Waechter & Biegler (2006).
     """
 
-    grid: str = eqx.field(static=True, default="lgr-right")
+    grid: str | NodeFamily = eqx.field(static=True, default="lgr-right")
     nodes: int = eqx.field(static=True, default=6)
     segments: int = eqx.field(static=True, default=12)
     fractions: Any = None
@@ -113,10 +115,7 @@ class Pseudospectral(Method):
     )
 
     def __check_init__(self):
-        if self.grid not in FAMILIES:
-            raise ValueError(
-                f"Pseudospectral: grid is {self.grid!r}; choose one of {', '.join(FAMILIES)}."
-            )
+        node_family(self.grid, "Pseudospectral: grid")
         if self.segments < 1:
             raise ValueError(f"Pseudospectral: segments is {self.segments}; give at least 1.")
         if self.max_iterations < 1:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxguide.nominal.direct.collocation import Collocation, collocation
 from jaxguide.nominal.direct.unknowns import Arcwise, Counts, Equations, Primal, Scale
 from jaxguide.problem import Problem, is_free, with_parameters
-from jaxguide.spectral import legendre_matrix
+from jaxguide.spectral import NodeFamily, legendre_matrix
 
 
 class Nodes(NamedTuple):
@@ -50,7 +50,7 @@ class Transcription(eqx.Module):
     problem: Problem
     scale: Scale
     edges: Float[Array, "edge clock"]
-    family: str = eqx.field(static=True)
+    family: str | NodeFamily = eqx.field(static=True)  # name or family
     points: int = eqx.field(static=True)
     arcwise: "Arcwise | None" = None
     log: bool = eqx.field(static=True, default=False)

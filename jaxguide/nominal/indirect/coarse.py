@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.conditions.canonical import canonical_rates
-from jaxguide.linalg import solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.indirect.boundary import Unknowns, boundary_residual, horizon, unknown_sizes
 from jaxguide.nominal.steps import rk4
 from jaxguide.problem import Problem, is_free
@@ -67,7 +67,7 @@ def damped_newton(problem: Problem, z: Unknowns, steps: int) -> tuple[Unknowns, 
         relative = jnp.where(jnp.isfinite(relative), relative, jnp.inf)
         better = relative < _RISE * left
         v = jnp.where(better, trial, v)
-        dv = jnp.where(better, -solve(jacobian, r), dv)
+        dv = jnp.where(better, -gauss_solve(jacobian, r), dv)
         step = jnp.where(better, 1.0, _SHORTER * step)
         left = jnp.where(better, relative, left)
         return v, dv, step, left, jnp.where(better, trial_cost, cost), k + 1

@@ -91,26 +91,28 @@ def _extremal(
         residual=jnp.zeros((), t.dtype),
         problem=problem,
     )
-    residual, result = _judged(*jax.lax.stop_gradient((extremal, z, ends)))
-    return dataclasses.replace(extremal, residual=residual, result=result)
+    still = jax.lax.stop_gradient(extremal)
+    worst = _worst(still, *jax.lax.stop_gradient((z, ends)))
+    return dataclasses.replace(extremal, residual=worst, result=judged(still, worst))
 
 
-def _judged(
-    extremal: Extremal, z: Unknowns, ends: Float[Array, "arc two_n_1"]
-) -> tuple[Array, RESULTS]:
-    """The largest relative error of a boundary condition; and whether the extremal converged,
-    minimises H everywhere, and keeps to its bounds."""
-    size = extremal.sizes()
-    of = boundary_sizes(extremal.problem, ends.shape[0], size)
+def _worst(extremal: Extremal, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:
+    """The largest error of a boundary condition, relative to its size."""
+    of = boundary_sizes(extremal.problem, ends.shape[0], extremal.sizes())
     of = jnp.where(jnp.isfinite(of), of, 1.0)
-    worst = jnp.max(jnp.abs(boundary_residual(extremal.problem, z, ends)) / of)
+    return jnp.max(jnp.abs(boundary_residual(extremal.problem, z, ends)) / of)
+
+
+def judged(extremal: Extremal, worst: Float[Array, ""]) -> RESULTS:
+    """Whether an extremal whose boundary conditions are missed by `worst`, relative to their sizes,
+    converged, minimises H everywhere (Legendre-Clebsch), and keeps to its bounds."""
     problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
     h_uu = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))(
         problem, t, x, u, extremal.costate
     )
     minimising = jnp.all(jax.vmap(cholesky_positive)(h_uu))
     m = extremal.multipliers
-    over = bounded(problem, t, x, u, (m.path, m.state, m.control), size)
+    over = bounded(problem, t, x, u, (m.path, m.state, m.control), extremal.sizes())
     inside = [jnp.all(part <= _WITHIN) for part in (over.path, over.state, over.control)]
     span = jnp.abs(t[-1] - t[0])
     for entry, time in ((problem.initial_time, t[0]), (problem.final_time, t[-1])):
@@ -119,4 +121,4 @@ def _judged(
     result = RESULTS.where(minimising, RESULTS.successful, RESULTS.not_minimising)
     result = RESULTS.where(jnp.all(jnp.stack(inside)), result, RESULTS.bounds_violated)
     result = RESULTS.where(jnp.isfinite(extremal.objective), result, RESULTS.undefined)
-    return worst, RESULTS.where(worst <= _CONVERGED, result, RESULTS.not_converged)
+    return RESULTS.where(worst <= _CONVERGED, result, RESULTS.not_converged)

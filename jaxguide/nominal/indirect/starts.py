@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of
-from jaxguide.linalg import solve
+from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.indirect.boundary import Unknowns
 from jaxguide.nominal.starts import UNBOUNDED, bounds_middle, control_ends, drawn_final_time
 from jaxguide.nominal.steps import rk4
@@ -40,7 +40,7 @@ def random_start(problem: Problem, key: Array, arcs: int, steps: int, dtype: Any
     normal, q = a.T @ a, a.shape[1]
     mean = jnp.trace(normal) / max(q, 1)
     ridge = _RIDGE * jnp.where(mean > 0, mean, 1.0)
-    nu = -solve(normal + ridge * jnp.eye(q, dtype=dtype), a.T @ b)
+    nu = -gauss_solve(normal + ridge * jnp.eye(q, dtype=dtype), a.T @ b)
     costate = lams[:, :, 0] + lams[:, :, 1:] @ nu
     starts = jnp.concatenate([xs, costate], axis=1)[: arcs * steps : steps]
     none = jnp.zeros((0,), dtype)

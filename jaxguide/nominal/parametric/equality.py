@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.linalg import cholesky_positive, solve
+from jaxguide.linalg import cholesky_positive, gauss_solve
 from jaxguide.nominal.roots import implicit_root
 
 Values = Callable[[Array, Any], tuple[Array, Array]]  # (a, args) -> f, c
@@ -56,7 +56,7 @@ def derivatives(values: Values, a: Array, args: Any) -> Derivatives:
     """Exact, by autodiff: forward over reverse."""
     jacobian, (f, c) = jax.jacrev(lambda a: _twice(values(a, args)), has_aux=True)(a)
     gradient, jacobian = jacobian
-    nu = solve(jacobian @ jacobian.T, -jacobian @ gradient)
+    nu = gauss_solve(jacobian @ jacobian.T, -jacobian @ gradient)
 
     def slope(a: Array) -> Array:
         return conditions(values, KKTPoint(a, nu), args).a
@@ -80,10 +80,10 @@ class _Tangent(NamedTuple):
 def _tangent(d: Derivatives) -> _Tangent:
     gram = d.jacobian @ d.jacobian.T
     eye = jnp.eye(d.gradient.shape[0], dtype=d.gradient.dtype)
-    projector = eye - d.jacobian.T @ solve(gram, d.jacobian)
+    projector = eye - d.jacobian.T @ gauss_solve(gram, d.jacobian)
     size = jnp.max(jnp.abs(d.hessian)) + jnp.finfo(d.f.dtype).tiny
     matrix = projector @ d.hessian @ projector + size * (eye - projector)
-    return _Tangent(-d.jacobian.T @ solve(gram, d.c), projector, matrix, size)
+    return _Tangent(-d.jacobian.T @ gauss_solve(gram, d.c), projector, matrix, size)
 
 
 def minimise(
@@ -108,7 +108,7 @@ def minimise(
             jnp.zeros_like(t.size),
         )
         along = t.projector @ (d.gradient + d.hessian @ t.normal)
-        step = t.normal - t.projector @ solve(shifted(delta), along)
+        step = t.normal - t.projector @ gauss_solve(shifted(delta), along)
         length = jnp.max(jnp.abs(step))
         step = step / jnp.maximum(1.0, length)
         weight = 2 * jnp.max(jnp.abs(d.nu), initial=0.0) + 1.0

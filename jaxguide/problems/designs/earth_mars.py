@@ -1,4 +1,4 @@
-"""Earth-Mars: the fewest samples, and where, that keep the 99th percentile of the miss."""
+"""Earth-Mars: how few samples, and where, keep the 99th percentile of the miss below a bound."""
 
 import functools
 from typing import Any
@@ -28,11 +28,11 @@ from jaxguide.tuning.record import Tuned
 from jaxguide.tuning.relaxation import sample_lengths
 from jaxguide.tuning.risk import above, quantile_bounds, smooth_quantile
 
-LEVEL = 0.99
+LEVEL = 0.99  # of the percentile
 MOST = 166  # samples of 0.02 TU in 3.32
-MODES = 12  # of the samples' density: the control turns within a tenth of the horizon
+MODES = 12  # Legendre modes of the density: the control turns within a tenth of the horizon
 STEPS = 4  # of Runge-Kutta a sample while tuning: a tenth of a radian's turn a step at worst
-MARGIN = 0.9  # of the paper's percentile: what 512 cases scatter
+MARGIN = 0.9  # of the paper's percentile: that of 512 cases scatters by a tenth
 HOLDS = {"deviation": HoldDeviation, "history": History}
 
 
@@ -44,16 +44,25 @@ def design(
     most: int = MOST,
     steps: int = 300,
 ) -> Ready:
-    """Neighbouring optimal control on the paper's transfer: how many samples, and where.
+    """Neighbouring optimal control on the 2002 paper's transfer: how many samples, and where.
 
     Each sample is one measurement and one stored gain, evaluated once: "gain evaluations". Samples
-    lie where a density has them whose logarithm is a Legendre series; their number is relaxed
-    (`sample_lengths`). The objective is the number over the paper's 166, and beyond `bound` the
-    99th percentile of the miss, sqrt(v_r^2 + (v_t - r^(-1/2))^2) at tf in canonical units.
+    are spread with a density whose logarithm is a Legendre series; their number is relaxed to a
+    real one (`sample_lengths`). The objective is the number over the paper's 166, plus a penalty
+    where the 99th percentile of the miss, sqrt(v_r^2 + (v_t - r^(-1/2))^2) at tf in canonical
+    units, is above `bound`.
 
-    **Arguments:** `hold`: of the deviation between samples: "deviation" (zero-order) or "history"
-    (eq. 49); `bound`: of the percentile; default `MARGIN` of the paper's interval's with the same
-    hold. `samples`: to start from, evenly; `most`: that there may be.
+    **Arguments:**
+
+    - `hold`: of the deviation between samples: "deviation" (zero-order) or "history" (2002 paper,
+      eq. (49)).
+    - `bound`: of the percentile; by default `MARGIN` times that of the paper's sample interval with
+      the same hold.
+    - `extremal`: the nominal, solved for if absent.
+    - `samples`: their number at first, evenly spread; `most`: the largest number allowed.
+    - `steps`: of the optimiser.
+
+    **Raises:** `ValueError` for another `hold`.
     """
     if hold not in HOLDS:
         raise ValueError(f"design: hold is {hold!r}; choose one of {', '.join(HOLDS)}.")
@@ -96,8 +105,8 @@ def _build(loop: "_Loop", most: int, own: dict[str, Any]) -> tuple[Mission, Arra
 
 
 def _rounded(loop: "_Loop", ready: Ready, most: int, tuned: Tuned) -> Ready:
-    """The best of the integers beside the number found, and their places tuned on: between two
-    integers the samples lie elsewhere than at either."""
+    """The better of the two integers beside the number found, and the places tuned further for it:
+    the best places of an integer differ from those of a number between two integers."""
     own, keys = jax.tree_util.tree_map(jnp.asarray, tuned.design), _keys(0, ready.cases)
     at = eqx.filter_jit(lambda n: ready.objective(ready.build(own | {"samples": n}), keys)[0])
     found = counted(lambda n: at(jnp.asarray(float(n))), own["samples"], tuned.loss, 2, most)
@@ -129,20 +138,20 @@ def _rounded(loop: "_Loop", ready: Ready, most: int, tuned: Tuned) -> Ready:
 
 
 def _places(own: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Sample times over the horizon, the number rounded."""
+    """Sample times as fractions of the horizon, the number of samples rounded."""
     count = max(round(float(own["samples"])), 1)
     lengths = sample_lengths(float(count), count, 1.0, jnp.asarray(own["places"]))
     return {"samples": np.append(0.0, np.cumsum(np.asarray(lengths)))[:-1]}
 
 
 def history(**options: Any) -> Ready:
-    """As `design`, the law's own open-loop control flown between samples."""
+    """`design` with the law's own open-loop control between samples; `options`: of `design`."""
     return design("history", **{"samples": 60.0, "most": 60, "steps": 200, **options})
 
 
 def schedule(extremal: Extremal) -> GainSchedule:
-    """Exact gains anywhere up to a thousandth of the horizon before the end, whatever the samples:
-    further on they are held."""
+    """Exact gains at 167 times up to a thousandth of the horizon before the end, for any samples in
+    between; later the last gain is held."""
     end = float(extremal.final_time)
     return gain_schedule(extremal, np.append(np.arange(MOST) * SAMPLE_INTERVAL, 0.999 * end))
 
@@ -176,7 +185,7 @@ def _fly(flying: Mission, keys: Array) -> Any:
 
 
 def cost_of(flying: Any, flight: Any) -> Array:
-    """The plant has no running cost, so that ends suffice."""
+    """The plant's cost; it has no running cost, so that a flight's ends suffice."""
     return cost(flying, flight)
 
 
@@ -187,8 +196,8 @@ def _keys(seed: int, cases: int) -> Array:
 def _confirm(
     loop: _Loop, tuned: Tuned, cases: int, seed: int, found: Count | None = None
 ) -> Confirmed:
-    """On fresh cases, with a mission of as many samples as there are, finer integration, and a
-    sample less and more."""
+    """Flies fresh cases with the tuned number of samples as the mission's own, with finer
+    integration, and with one sample less and one more."""
     own, keys = tuned.design, _keys(seed, cases)
     count = max(round(float(own["samples"])), 2)
     true = lambda n, steps: loop.mission(jnp.asarray(float(n)), own["places"], n, steps)
@@ -208,8 +217,8 @@ def _confirm(
     notes = [f"{100 * saved:.1f} % fewer gain evaluations than the paper's, the same hold"]
     if found is not None:
         notes.append(f"objective before the places were tuned on: {found}")
-    told = ", ".join(f"{n}: {beside[n]:.4g}" for n in sorted(beside))
-    notes.append(f"99th percentile with a sample less and more, the same density: {told}")
+    listed = ", ".join(f"{n}: {beside[n]:.4g}" for n in sorted(beside))
+    notes.append(f"99th percentile with a sample less and more, the same density: {listed}")
     return Confirmed(rows, beside, tuple(notes), bool(better))
 
 

@@ -1,4 +1,4 @@
-"""Lunar launch: where the control's nodes belong, and how many gain stations are worth storing."""
+"""Lunar launch: the best places of the control's nodes, and which gain stations to store."""
 
 import functools
 import itertools
@@ -35,27 +35,30 @@ from jaxguide.tuning.record import Tuned
 from jaxguide.tuning.relaxation import cooling, occupancy
 from jaxguide.tuning.thinned import ThinnedGains
 
-NODES, STATIONS = 9, 7  # from the last two nodes the end cannot be controlled
-WEIGHTS = (1.0, 0.1, 0.1)  # of squared errors of y [ft], u and v [ft/s] at the end
-PRICE = 0.05  # of a stored station, in e-folds of the mean squared error
+NODES, STATIONS = 9, 7  # the thesis's nodes; from the last two the end cannot be controlled
+WEIGHTS = (1.0, 0.1, 0.1)  # of squared errors of y [ft], u and v [ft/s] at the end (chosen)
+PRICE = 0.05  # of a stored station, in e-folds of the mean squared error (chosen)
 SAMPLES = 84  # 72 in the longest flight, and some for its end
 
 
 def design(steps: int = 80, nominal: Extremal | None = None) -> Ready:
-    """The library's own loop (exact gains, scaled by the time to go): nine nodes of the control,
-    anywhere, and seven gain stations at the first of them, each of which may be left out.
+    """The library's own closed loop (exact gains, scaled by the time to go): the places of nine
+    nodes of the control, and which of seven gain stations, at the first seven nodes, are stored.
 
     The objective is the logarithm of the mean weighted squared error at the end over dispersed
-    launches, and a price for each station. Every gradient goes through the nominal re-optimised for
-    the nodes, its second derivatives and gains, the search for the reference time, and the flights.
+    launches, plus a price for each station. Every gradient goes through the nominal re-optimised
+    for the nodes, its second derivatives and gains, the search for the reference time, and the
+    flights.
+
+    **Arguments:** `steps`: of the optimiser; `nominal`: solved for if absent.
     """
     nominal = solve(LunarLaunch(), PiecewiseLinear(NODES)) if nominal is None else nominal
-    make = functools.partial(build, nominal)
+    make = functools.partial(_build, nominal)
     return Ready(
         name="lunar-launch",
         about="nodes of the control, and the gain stations worth storing",
-        objective=objective,
-        # Each inner station is there by 0.88 at first.
+        objective=_objective,
+        # A logit of 2: each inner station is present to 0.88 at first, and may still change.
         design={
             "nodes": Ascending(np.linspace(0.0, 1.0, NODES)),
             "present": jnp.full(STATIONS - 2, 2.0),
@@ -71,10 +74,10 @@ def design(steps: int = 80, nominal: Extremal | None = None) -> Ready:
     )
 
 
-def build(
+def _build(
     nominal: Extremal, own: dict[str, Any], temperature: Any
 ) -> tuple[Mission, Float[Array, " g"]]:
-    """The mission, and how far each station is there."""
+    """The mission, and each station's presence from 0 to 1."""
     present = jnp.pad(occupancy(own["present"], temperature), 1, constant_values=1.0)
     nodes = own["nodes"]
     again = solve(LunarLaunch(), PiecewiseLinear(nodes), nominal, throw=False)
@@ -88,12 +91,13 @@ def build(
 
 
 def squared_miss(flying: Mission, flight: Flight) -> Float[Array, ""]:
+    """Sum of the squared errors of y, u, v at the end, with WEIGHTS [ft^2]."""
     plant: Any = flying.plant
     off = flight.final_state[1:] - jnp.stack([jnp.asarray(v) for v in plant.orbit])
     return jnp.sum(jnp.asarray(WEIGHTS, off.dtype) * off**2)
 
 
-def objective(built: tuple[Mission, Array], keys: Array) -> tuple[Array, dict[str, Array]]:
+def _objective(built: tuple[Mission, Array], keys: Array) -> tuple[Array, dict[str, Array]]:
     flying, present = built
     error = jnp.mean(Flown(dispersions(), squared_miss, chunk=20)(flying, keys))
     stations = jnp.sum(present)
@@ -107,10 +111,11 @@ def _places(own: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def subsets(make: Any, own: dict[str, Any], keys: Array) -> dict[tuple[int, ...], float]:
-    """The true objective of every way to leave inner stations out, the nodes as they are."""
-    # A logit of 40 at temperature 1 is a one or a zero, to rounding.
+    """The objective, not relaxed, of every choice of inner stations, with the nodes of `own`: by
+    choice, 1 where a station is stored."""
+    # A logit of 40 or -40 at temperature 1 is a one or a zero, to rounding.
     true = jax.jit(
-        lambda nodes, there: objective(
+        lambda nodes, there: _objective(
             make({"nodes": nodes, "present": there}, jnp.ones(())), keys
         )[0],
         compiler_options=quick_compilation(),  # pyright: ignore[reportArgumentType]
@@ -121,7 +126,7 @@ def subsets(make: Any, own: dict[str, Any], keys: Array) -> dict[tuple[int, ...]
 
 
 def _confirm(make: Any, tuned: Tuned, cases: int, seed: int) -> Confirmed:
-    """On fresh cases; every other choice of stations beside the one found."""
+    """Flies fresh cases, and compares the choice of stations found with every other."""
     chosen = tuple(int(p > 0) for p in tuned.design["present"])
     every = subsets(make, tuned.design, _keys(seed, 64))
     order = sorted(every, key=lambda c: every[c])

@@ -1,4 +1,4 @@
-"""Moon lander: where the breaks of a fixed mesh belong, when the control switches."""
+"""Moon lander: the best places of a fixed mesh's breaks for a control that switches."""
 
 import dataclasses
 import math
@@ -20,13 +20,18 @@ from jaxguide.tuning.meshes import mesh_error
 from jaxguide.tuning.ready import Confirmed, Ready
 from jaxguide.tuning.record import Tuned
 
+# Coarse, so that the places of the breaks matter; 1e-10, as gradients are of the converged solve.
 METHOD = Pseudospectral(nodes=3, tolerance=1e-10, refinements=0)
 
 
 def design(segments: int = 4, steps: int = 200) -> Ready:
-    """Break points of `segments` segments of three nodes, from even ones, that leave the least
-    `mesh_error`: each gradient goes through the converged direct solve by the implicit function
-    theorem. The known switch is not told.
+    """Breaks of a mesh of `segments` segments of three nodes with the least `mesh_error`, starting
+    from even ones.
+
+    Each gradient goes through the converged direct solve by the implicit function theorem. The
+    switch is known in closed form (`switch`) but is not used to find the breaks.
+
+    **Arguments:** `steps`: of the optimiser.
 
     **Raises:** `ValueError` for fewer than two segments, which leave no break to move.
     """
@@ -41,7 +46,7 @@ def design(segments: int = 4, steps: int = 200) -> Ready:
         about=f"breaks of a mesh of {segments} segments, for a control that switches",
         objective=objective,
         design={"breaks": Ascending(np.linspace(0.0, 1.0, segments + 1))},
-        build=build,
+        build=_build,
         optimizer=optax.adam(optax.cosine_decay_schedule(0.1, steps)),
         steps=steps,
         cases=1,
@@ -51,14 +56,17 @@ def design(segments: int = 4, steps: int = 200) -> Ready:
     )
 
 
-def build(own: dict[str, Any]) -> Extremal:
+def _build(own: dict[str, Any]) -> Extremal:
     method = dataclasses.replace(METHOD, fractions=own["breaks"])
     return solve(MoonLander(), method, throw=False)
 
 
 def switch() -> tuple[float, float]:
-    """When full thrust begins and when it ends at rest on the ground, in closed form: the speed
-    after a fall of t is what full thrust takes out over the height that is left."""
+    """Times at which full thrust begins and at which the lander rests on the ground.
+
+    In closed form: after a free fall of t, full thrust must stop the speed within the remaining
+    height.
+    """
     lander = MoonLander()
     g, most = float(np.asarray(lander.gravity)), lander.control_bounds[1]
     (h, v), a = lander.initial_state, float(np.asarray(most)) - g
@@ -73,7 +81,7 @@ def _confirm(tuned: Tuned, cases: int, seed: int) -> Confirmed:
     best = MoonLander.reference.value
     columns = []
     for own in (tuned.start, tuned.design):
-        extremal = build(jax.tree_util.tree_map(jnp.asarray, own))
+        extremal = _build(jax.tree_util.tree_map(jnp.asarray, own))
         nearest = float(np.min(np.abs(np.asarray(extremal.breaks) - at)))
         off = abs(float(extremal.objective) / best - 1)
         columns.append((float(mesh_error(extremal)), off, nearest))

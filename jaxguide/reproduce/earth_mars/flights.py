@@ -1,4 +1,4 @@
-"""The six cases of Table 1: flown by every variant of the law at once, and re-optimised."""
+"""The six cases of the 2002 paper, Table 1: flown by every variant of the law, and re-optimised."""
 
 import dataclasses
 
@@ -17,25 +17,27 @@ from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.nominal.indirect.shooting import Shooting
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
-from jaxguide.reproduce.earth_mars.collocation import at
+from jaxguide.reproduce.earth_mars.collocation import linearized_at
 from jaxguide.reproduce.earth_mars.published import CASES
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 
-METHOD = Shooting(starts=4)  # one compiled program serves the nominal and the six re-solves
+# One compiled program serves the nominal and the six re-solves. 4 starts, by experiment: each of
+# the seven finds its extremal.
+METHOD = Shooting(starts=4)
 # The control turns by 20 rad/TU, that is 0.025 rad a step: its fourth power over 120 is 3e-9, of a
 # control that moves the end by 0.1 LU.
 INTEGRATOR = RungeKutta4(16)
 
 
 def reoptimise(case: tuple[float, ...]) -> Extremal:
-    """The extremal from a perturbed start, found afresh: no guess from the nominal."""
+    """The extremal from the nominal start plus `case` (LU, LU/TU), solved without a guess."""
     start = tuple(a + b for a, b in zip(EarthMars.initial_state, case, strict=True))
     return solve(dataclasses.replace(EarthMars(), initial_state=start), METHOD)
 
 
 def stage_times(times: np.ndarray) -> Float[np.ndarray, "sample stage"]:
-    """When the integrator asks for the control, within each sample."""
+    """Times [TU] at which the integrator asks for the control, sample by sample."""
     return times[:, None] + SAMPLE_INTERVAL * np.asarray(INTEGRATOR.stages)[None, :]
 
 
@@ -43,24 +45,25 @@ def stage_times(times: np.ndarray) -> Float[np.ndarray, "sample stage"]:
 def histories(
     schedule: GainSchedule, instants: Float[Array | np.ndarray, "sample stage"]
 ) -> Float[Array, "sample stage m n"]:
-    """The schedule's own open-loop control at the `instants`, per deviation at each sample."""
+    """The schedule's open-loop control at the `instants`, per deviation at the sample's start."""
     # One `vmap` over all: two, nested, take twice as long to trace.
     samples = jnp.repeat(instants[:, 0], instants.shape[1])
     found = jax.vmap(schedule.history)(samples, instants.reshape(-1))
     return found.reshape(*instants.shape, *found.shape[1:])
 
 
-def fly_cases(
+def fly_variants(
     schedule: GainSchedule,
     instants: Float[np.ndarray, "sample stage"],
     of_exact: Float[Array, "sample stage m n"],
     of_paper: Float[Array, "sample stage m n"],
     wrong: Float[np.ndarray, "sample stage m n"],
 ) -> dict[str, Flight]:
-    """Variant -> the six flights of Table 1, batched, from histories at the `stage_times`.
+    """The six flights of Table 1 by variant of the law, batched, from control histories at the
+    `stage_times`.
 
-    The variants differ only in what is looked up at the integrator's stages, so one program flies
-    them all, each on the whole history of a law prepared for it.
+    The variants differ only in the numbers looked up at the integrator's stages, so one program
+    flies all of them; each has its whole history prepared beforehand.
     """
     extremal = schedule.extremal
     law, start = NeighboringOptimal(schedule), extremal.x[0]
@@ -68,7 +71,8 @@ def fly_cases(
         extremal.problem, law, start, SAMPLE_INTERVAL, hold=History(), integrator=INTEGRATOR
     )
     samples, stages = instants.shape
-    x, u = (a.reshape(samples, stages, -1) for a in at(extremal, instants.reshape(-1))[0][:2])
+    points, _ = linearized_at(extremal, instants.reshape(-1))
+    x, u = (a.reshape(samples, stages, -1) for a in points[:2])
     exact, paper = np.asarray(of_exact), np.asarray(of_paper)
     held = lambda a: np.broadcast_to(a[:, :1], a.shape)
     variants = {  # nominal and deviation at the stages
@@ -93,7 +97,7 @@ def fly_cases(
 
 @eqx.filter_jit
 def _fly(mission: Mission, prepared: Prepared, deviations: Array) -> Flight:
-    """Every variant with every deviation: one `vmap` over all, which traces half of what two do."""
+    """Every variant with every deviation, in one `vmap`: two, nested, trace twice as much."""
 
     def one(law: PreparedNeighboring, dx: Array) -> Flight:
         start = mission.initial_state + dx
@@ -108,5 +112,5 @@ def _fly(mission: Mission, prepared: Prepared, deviations: Array) -> Flight:
 
 
 def final_errors(flight: Flight, reoptimised: list[Extremal]) -> np.ndarray:
-    """Flown minus re-optimised final state, by case."""
+    """Flown minus re-optimised final state, shape (case, n), in LU and LU/TU."""
     return np.asarray(flight.final_state) - np.stack([np.asarray(e.x[-1]) for e in reoptimised])

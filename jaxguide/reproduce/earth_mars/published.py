@@ -9,7 +9,7 @@ from jaxguide.problems.earth_mars import EarthMars
 
 UNITS = {"t": "TU", "r": "LU", "v_r": "LU/TU", "v_t": "LU/TU", "epsilon": "rad"}
 STATES = EarthMars.state_names
-CASES = (  # Table 1: initial deviations
+CASES = (  # 2002 paper, Table 1: initial deviations
     (0.0033, 0.0, 0.0),
     (-0.0023, 0.0, 0.0),
     (0.0, 0.0033, 0.0),
@@ -17,7 +17,7 @@ CASES = (  # Table 1: initial deviations
     (0.0, 0.0, 0.0033),
     (0.0, 0.0, -0.0023),
 )
-RADIUS = 1.5252777006485894
+RADIUS = 1.5252777006485894  # LU, of the largest orbit
 COSTATE_START = (-1.8773359790285813, -0.9289336557779658, -2.0251562175129236)
 COSTATE_END = (-1.335605598082642, 1.4246678627489247, -1.2643944289290872)
 ANGLES = {  # tau: epsilon, unwrapped [rad]
@@ -30,7 +30,7 @@ ANGLES = {  # tau: epsilon, unwrapped [rad]
     3.0: 5.3173118910925155,
     3.32: 5.43825559149684,
 }
-GAINS_EXACT = {  # tau: K
+GAINS_EXACT = {  # tau [TU]: K, rad per LU and LU/TU
     0.0: (1.582443022155582, 0.9407206628661531, 1.2580347950330928),
     0.5: (1.696721216015938, 0.9991200900791067, 1.5705182514885947),
     1.0: (1.9838292100654153, 1.5187491790534633, 2.5199298143991187),
@@ -41,7 +41,7 @@ GAINS_EXACT = {  # tau: K
     3.2: (1022.5332974070498, -5053.11544308516, 3861.23462969852),
     3.3: (39957.47662562366, -173770.2404835109, 150548.3053211569),
 }
-GAINS_LEAST_SQUARES = {  # tau: K of eq. (45), N = 64
+GAINS_LEAST_SQUARES = {  # tau: K of the 2002 paper, eq. (45), N = 64
     0.0: (1.0881634375397569, 0.9843018519556606, 0.2756792431994059),
     0.5: (1.1780093656686923, 0.7050502174371309, 0.5609761394532526),
     1.0: (1.6734846820441367, 1.1084321626024416, 1.925573663326005),
@@ -92,7 +92,7 @@ REOPTIMISED = (  # final states of the re-optimised six, 1e-15
     (1.5319187307948328, 0.0, 0.8079456310223875),
     (1.5205994314413414, 0.0, 0.8109472177119175),
 )
-FINAL_ERRORS = {  # variant: flown minus re-optimised final state, by case
+FINAL_ERRORS = {  # variant of the law: flown minus re-optimised final state, by case
     "lstsq64_interp": (
         (5.741302344653e-06, 1.902518517468e-07, -6.737161055814e-06),
         (2.795415176227e-06, 4.878107104779e-09, -3.245337307001e-06),
@@ -126,7 +126,7 @@ FINAL_ERRORS = {  # variant: flown minus re-optimised final state, by case
         (3.269836049924e-06, 2.646633907399e-08, -3.808913834891e-06),
     ),
 }
-TABLE_2 = (  # as printed
+TABLE_2 = (  # 2002 paper, as printed
     (-5.08e-06, -1.44e-07, -3.56e-06),
     (-2.64e-06, -2.96e-08, -1.65e-06),
     (-3.57e-06, -3.77e-09, -1.44e-07),

@@ -1,4 +1,4 @@
-"""The report's sections: each judges what was computed against its reference."""
+"""The report's sections: each judges computed numbers against their references."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxguide.flight.simulate import Flight
 from jaxguide.neighboring.gains import GainSchedule
-from jaxguide.reproduce.earth_mars.collocation import WRONG_SIGN_NODES, at, relative
+from jaxguide.reproduce.earth_mars.collocation import WRONG_SIGN_NODES, linearized_at, relative
 from jaxguide.reproduce.earth_mars.flights import INTEGRATOR, final_errors
 from jaxguide.reproduce.earth_mars.published import (
     ANGLES,
@@ -28,6 +28,7 @@ from jaxguide.trajectory import Extremal
 
 
 def nominal(report: Report, extremal: Extremal) -> None:
+    """The nominal extremal: 2002 paper, figure 2."""
     section = report.section(
         "Nominal",
         "Indirect multiple shooting from random starts; the paper shows the result in figure 2 "
@@ -38,13 +39,14 @@ def nominal(report: Report, extremal: Extremal) -> None:
     for where, k, reference in (("0", 0, COSTATE_START), ("tf", -1, COSTATE_END)):
         for name, value, wanted in zip(STATES, extremal.costate[k], reference, strict=True):
             section.add(f"costate of {name} at {where}", value, wanted, tolerance=1e-10)
-    angles = at(extremal, np.asarray(list(ANGLES)))[0].u[:, 0]
+    angles = linearized_at(extremal, np.asarray(list(ANGLES)))[0].u[:, 0]
     turns = 2 * np.pi * np.round((angles[0] - ANGLES[0.0]) / (2 * np.pi))
     for (t, reference), angle in zip(ANGLES.items(), angles - turns, strict=True):
         section.add(f"epsilon({t:g})", angle, reference, tolerance=1e-10, unit="rad")
 
 
 def gains(report: Report, exact: GainSchedule, paper: GainSchedule) -> None:
+    """Exact gains and the paper's least-squares gains, 2002 paper, eqs. (45), (49)."""
     times = np.asarray(exact.times)
     row = lambda schedule, t: np.asarray(schedule.K)[np.argmin(np.abs(times - t)), 0]
     section = report.section(
@@ -69,6 +71,7 @@ def gains(report: Report, exact: GainSchedule, paper: GainSchedule) -> None:
 
 
 def gain_errors(report: Report, errors: dict[str, dict[float, dict[int, float]]]) -> None:
+    """Convergence of the gains in the number of points; `errors` of `relative_gain_errors`."""
     section = report.section(
         "Error of K(0) and K(2) against N",
         "Max-norm of the row over its size. On the whole horizon the paper's choice, N = 64, is "
@@ -84,7 +87,7 @@ def gain_errors(report: Report, errors: dict[str, dict[float, dict[int, float]]]
             if reference is not None and tau == 0.0:
                 reference /= np.max(np.abs(GAINS_EXACT[tau]))  # the reference's is absolute
             if reference is not None and reference < 1e-8:
-                reference = None  # rounding
+                reference = None  # below 1e-8 the reference's own rounding shows
             text = f"K({tau:g}), least squares, N = {points - 1}"
             section.add(text, value, reference, relative=1e-3)
         for points, value in errors["square"][tau].items():
@@ -106,6 +109,7 @@ VARIANTS = {
 
 
 def table_2(report: Report, flights: dict[str, Flight], reoptimised: list[Extremal]) -> None:
+    """The six perturbed flights of the 2002 paper, Table 2, with each variant of the law."""
     section = report.section(
         "Re-optimised",
         "Each case solved again from its perturbed start, without a guess.",
@@ -132,6 +136,7 @@ def _errors(
     section: Section, flight: Flight, reoptimised: list[Extremal], name: str, judged: bool
 ) -> None:
     errors = final_errors(flight, reoptimised)
+    # A hundredth, and 2e-9 for components that are next to nothing: v_r ends at 3e-9 to 2e-7.
     limits = {"tolerance": 2e-9, "relative": 0.01} if judged else {}
     for i, row in enumerate(errors):
         for j, state in enumerate(STATES):
@@ -147,10 +152,12 @@ def _errors(
 
 
 def wrong_sign(report: Report, flights: dict[str, Flight], reoptimised: list[Extremal]) -> None:
+    """Table 2 again, with gains from the wrong sign of H_uu, which the printed numbers resemble."""
     printed = np.asarray(TABLE_2)
     errors = final_errors(flights["wrong sign"], reoptimised)
     ratio = errors / printed
-    near = lambda e: (np.abs(e / printed - 1) <= 0.1)[:, [0, 2]].sum(axis=0)
+    within = 0.1  # of the printed number
+    near = lambda e: (np.abs(e / printed - 1) <= within)[:, [0, 2]].sum(axis=0)
     counts, right = near(errors), near(final_errors(flights["lstsq64_interp"], reoptimised))
     section = report.section(
         "Table 2 with the sign of H_uu taken wrongly",
@@ -170,6 +177,7 @@ def wrong_sign(report: Report, flights: dict[str, Flight], reoptimised: list[Ext
 
 
 def dispersed(report: Report, dataset: Any) -> None:
+    """The sweep's success rate, standard deviations and percentiles."""
     attrs = dataset.attrs
     low, high = attrs["success_rate_bounds"]
     section = report.section(
@@ -177,7 +185,7 @@ def dispersed(report: Report, dataset: Any) -> None:
         "Initial state dispersed by 1e-3 (one sigma) in each component, exact gains, du held over "
         "samples of 0.02 TU and capped at 0.3 rad, Runge-Kutta 4, seed 0. Standard deviations are "
         "beside those of linear covariance propagation through the same loop, to four standard "
-        "errors of a sampled one. v_r has none to first order: the law nulls it, so what is left "
+        "errors of a sampled one. v_r has none to first order: the law nulls it, so the rest "
         "is of second order. Percentiles carry 95 % confidence bounds.",
     )
     note = f"95 % bounds {low:.6f} to {high:.6f}"

@@ -1,4 +1,4 @@
-"""Figures 5.1 to 5.8 of the thesis, the improvements with their loss curve, the sweep."""
+"""Figures 5.1 to 5.8 of Libby's thesis, the improvements with their loss curve, the sweep."""
 
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from jaxguide.flight.simulate import Flight
 from jaxguide.reproduce.lunar_launch.flights import CASES, TABLES, TARGET, deviations
 
 UNITS = {"t": "s", "x": "ft", "y": "ft", "u": "ft/s", "v": "ft/s", "theta": "rad"}
-SCALES = np.array([50_000.0, 5_444.0, 5_444.0])  # eq. (4.18)
+SCALES = np.array([50_000.0, 5_444.0, 5_444.0])  # of y, u, v: thesis, eq. (4.18)
 SHOWN = {"5.3": "thrust acceleration", "5.4": "lunar gravity"}
-PERCENT = 5.0  # of the perturbation shown; the thesis does not say which it shows
+PERCENT = 5.0  # perturbation shown; the thesis does not say which its figures show
 PANELS = ("y", "v", "u", "norm of the error")
 
 
@@ -27,7 +27,12 @@ def write_figures(
     placed: Any,
     dataset: Any,
 ) -> list[str]:
-    """Writes them to the folder `out`; returns the paths."""
+    """Writes the figures to the folder `out` and returns their paths.
+
+    **Arguments:** `loops`, `flown`: closed loops and their twenty flights, by reference variable
+    ("t", "u"); `ends`: final time and deviations of y, u, v by law; `placed`: of `place_nodes`;
+    `dataset`: of the sweep.
+    """
     seen = {law: _seen(loops[law], flown[law], law == "u") for law in loops}
     figures = {
         "fig5-1-to-4-thrust": compared(seen, "5.3"),
@@ -55,7 +60,11 @@ def _seen(loop: Mission, flight: Flight, by_velocity: bool) -> tuple[np.ndarray,
 
 @plot.styled
 def compared(seen: dict[str, tuple[np.ndarray, np.ndarray]], table: str) -> Figure:
-    """Figures 5.1 to 5.4 (table 5.3) or 5.5 to 5.8 (table 5.4)."""
+    """Thesis, figures 5.1 to 5.4 (`table` "5.3") or 5.5 to 5.8 ("5.4").
+
+    **Arguments:** `seen`: times of the updates and deviations of y, u, v there, by reference
+    variable.
+    """
     figure = Figure(figsize=(plot.WIDTH, 4.6))
     axes = figure.subplots(2, 2, sharex=True)
     words = {"t": "time as reference", "u": "horizontal velocity as reference"}

@@ -1,4 +1,4 @@
-"""The thesis's flights: twenty plants, two laws, and the optimum of each plant."""
+"""The flights of Libby's thesis: twenty plants, two laws, and the optimum of each plant."""
 
 import dataclasses
 from typing import Any
@@ -31,14 +31,18 @@ _NAMES = ["5.3"] * len(TABLE_5_3) + ["5.4"] * len(TABLE_5_4)
 TABLES = tuple(_NAMES)
 # Exact percentages: the printed columns of thrust and gravity are rounded.
 FACTORS = np.array([1 + case.percent / 100 for case in CASES])
+# Nominal thrust acceleration and gravity [ft/s^2]: thesis, section 4.1.
 THRUST = np.where(np.array(TABLES) == "5.3", 20.8 * FACTORS, 20.8)
 GRAVITY = np.where(np.array(TABLES) == "5.4", 5.32 * FACTORS, 5.32)
-TARGET = np.array([50_000.0, 5_444.0, 0.0])  # y, u, v
-STEPS = 40  # equal steps of horizontal velocity, Nowack's; and of eqs (5.2)-(5.6), found by trial
+TARGET = np.array([50_000.0, 5_444.0, 0.0])  # y [ft], u, v [ft/s]: thesis, section 4.1
+# Equal steps of horizontal velocity (Nowack's law), and steps of time with which eq. (5.1) flown
+# gives the digits of eqs. (5.2)-(5.6): both found by trial.
+STEPS = 40
 
 
 def printed_nominal() -> Certified:
-    """Eq. (5.1) flown: not quite the minimiser, and what the printed gains are about."""
+    """The control of the thesis, eq. (5.1), flown: not quite the minimiser, but the trajectory
+    about which the printed gains are computed."""
     problem, nodes = LunarLaunch(), np.linspace(0.0, 1.0, len(THETA))
     fly = lambda a: flown(problem, nodes, a, None)
     parameters = pack(problem, jnp.asarray(THETA)[:, None], FINAL_TIME)
@@ -46,8 +50,8 @@ def printed_nominal() -> Certified:
 
 
 def printed_end(nominal: Extremal) -> Flight:
-    """Eq. (5.1) flown as the thesis seems to have: Runge-Kutta 4 in 40 equal steps, which gives all
-    digits of eqs (5.3)-(5.6); flown exactly, y ends 4.9e-5 ft higher."""
+    """Eq. (5.1) flown as the thesis seems to have flown it: Runge-Kutta 4 in 40 equal steps, which
+    gives all digits of its eqs. (5.3)-(5.6); integrated exactly, y ends 4.9e-5 ft higher."""
     end = nominal.final_time
     loop = Mission(
         LunarLaunch(), OpenLoop(nominal), nominal.x[0], float(end) / STEPS, final_time=end,
@@ -57,13 +61,17 @@ def printed_end(nominal: Extremal) -> Flight:
 
 
 def thesis_mission(extremal: Extremal, **options: Any) -> Mission:
-    """Time as reference, chapter 4."""
+    """Closed loop with time as the reference variable, thesis, chapter 4.
+
+    **Arguments:** `options`: of `problems.lunar_launch.mission`.
+    """
     options = {"quiet": 0.0, "miss": None} | options
     return mission(extremal, "whole", LinearGains(), **options)
 
 
 def nowack_mission(nominal: Extremal) -> Mission:
-    """Horizontal velocity as reference; nine nodes even in it, and the correction held."""
+    """Closed loop with horizontal velocity as the reference variable: nine nodes evenly spaced in
+    it, the correction held over each step."""
     problem = StateAsTime(LunarLaunch(), "u", nominal)
     extremal = solve(problem, PiecewiseLinear())
     law = NeighboringSuboptimal(suboptimal_gains(extremal, "whole"))
@@ -73,8 +81,8 @@ def nowack_mission(nominal: Extremal) -> Mission:
 
 
 @eqx.filter_jit
-def fly_cases(loop: Mission, save: str = "samples") -> Flight:
-    """All twenty plants, batched."""
+def fly_plants(loop: Mission, save: str = "samples") -> Flight:
+    """The flights of all twenty plants, batched. `save`: as in `jg.simulate`."""
 
     def one(thrust: Array, gravity: Array) -> Flight:
         plant = loop.plant
@@ -87,7 +95,8 @@ def fly_cases(loop: Mission, save: str = "samples") -> Flight:
 
 
 def ends(flight: Flight, by_velocity: bool = False) -> Float[np.ndarray, "case 4"]:
-    """Final time, and deviations of y, u and v from the target."""
+    """Final time [s], and deviations of y [ft], u and v [ft/s] from the target; `by_velocity`: the
+    flight's clock is u, and time is its fourth state."""
     final = np.asarray(flight.final_state)
     if not by_velocity:
         return np.column_stack([flight.final_time, final[:, 1:] - TARGET[None]])
@@ -97,7 +106,7 @@ def ends(flight: Flight, by_velocity: bool = False) -> Float[np.ndarray, "case 4
 
 @eqx.filter_jit
 def optimal_times(nominal: Extremal) -> Float[Array, " case"]:
-    """The nine-node optimum of every plant, from the nominal, batched."""
+    """Final time [s] of every plant's own nine-node optimum, batched, with the nominal as guess."""
 
     def one(thrust: Array, gravity: Array) -> Array:
         problem = dataclasses.replace(LunarLaunch(), thrust=thrust, gravity=gravity)
@@ -108,7 +117,8 @@ def optimal_times(nominal: Extremal) -> Float[Array, " case"]:
 
 @eqx.filter_jit
 def deviations(loop: Mission, flight: Flight) -> tuple[Array, Array]:
-    """What the law saw: reference time and deviation from the nominal at each sample, by case."""
+    """Reference time and deviation from the nominal at each sample, as the law computes them, by
+    case."""
     law: Any = loop.law
     schedule = law.schedule
 

@@ -1,12 +1,16 @@
-"""What the thesis prints, digits lost in scanning restored and marked; and independent numbers."""
+"""Numbers that Libby's thesis prints, digits lost in scanning restored and marked; and numbers of a
+reference computed without this package."""
 
 from typing import NamedTuple
 
 
 class Case(NamedTuple):
-    """One row pair of Table 5.3 or 5.4: the perturbation in per cent; the optimal final time; final
-    time [s] and deviations of y [ft], u and v [ft/s] at the end, with time (`by_time`) and with
-    horizontal velocity (`by_velocity`) as reference."""
+    """One pair of rows of the thesis's Table 5.3 or 5.4.
+
+    - `percent`: the perturbation. `optimal`: the optimal final time [s].
+    - `by_time`, `by_velocity`: final time [s] and deviations of y [ft], u and v [ft/s] at the end,
+      with time or with horizontal velocity as reference.
+    """
 
     percent: float
     optimal: float
@@ -38,7 +42,8 @@ TABLE_5_1 = {
     7: ((-4.29e-05, 0.000178, -0.00194), (-1.94e-05, 7.09e-06, -0.00159)),
     8: ((-0.000248, 0.000583, -0.0056), (0.000247, -0.00109, 0.00271)),
 }
-# 1e-3 of the change of the final time, as a parameter of the whole horizon.
+# Change of the final time, as a parameter of the whole horizon, in 1e3 s, per deviation of y [ft],
+# u, v [ft/s] at the node.
 TABLE_5_2 = {
     1: (-7.76e-08, -4.87e-05, -2.37e-05),
     2: (-8.87e-08, -5.56e-05, -2.41e-05),
@@ -49,7 +54,7 @@ TABLE_5_2 = {
     7: (-3.13e-07, -0.000195, -3.15e-05),
     8: (-6.32e-07, -0.000389, -4.18e-05),
 }
-# Digits that the scan has lost, read from what is computed: table, node, row, column.
+# Digits that the scan has lost, restored from computed values: table, node, row, column.
 RESTORED = {
     ("5.1", 3, 1, "y"),
     ("5.1", 4, 1, "y"),

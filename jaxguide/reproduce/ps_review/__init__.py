@@ -1,5 +1,5 @@
 """Ross & Karpenko, "A Review of Pseudospectral Optimal Control: From Theory to Flight" (Annual
-Reviews in Control 36, 2012), sections 3 and 4: what they say of grids, weights, covectors and
+Reviews in Control 36, 2012), sections 3 and 4: their statements on grids, weights, covectors and
 rates, computed.
 """
 
@@ -13,8 +13,8 @@ from jaxguide.reproduce.stages import Stages
 
 
 def run(out: Path | None = None, progress: Progress | None = None) -> Report:
-    """Every claim of the two sections that has a number in it, and figures 4, 5, 7, 8 and 9 in the
-    folder `out` if there is one."""
+    """Every claim of the two sections that has a number in it; figures 4, 5, 7, 8, 9 and two more
+    go to the folder `out`, if given."""
     report = Report("Pseudospectral optimal control: a review (Ross & Karpenko 2012)")
     meter = NoProgress() if progress is None else progress
     stages = Stages(report, meter, len(sections.ALL) + (out is not None))

@@ -1,4 +1,5 @@
-"""The covector mapping principle in numbers: figure 6, eqs (23)-(25), Proposition 1, Remark 3."""
+"""The covector mapping principle in numbers: Ross & Karpenko, review (2012), figure 6, eqs.
+(23)-(25), Proposition 1, Remark 3."""
 
 from typing import NamedTuple
 
@@ -8,11 +9,12 @@ from jaxguide.nominal.direct.collocation import Collocation, collocation, left_n
 from jaxguide.reproduce.ps_review.lq import Tracking, discretise, end_rows
 from jaxguide.spectral.grids import evaluation
 
-FREQUENCY, PHASE = 3.0, 0.4
+FREQUENCY, PHASE = 3.0, 0.4  # of x_1: half an oscillation on [-1, 1], no symmetry
 
 
 def oscillator() -> Tracking:
-    r"""$\dot x_1 = x_2,\ \dot x_2 = -t x_1 + u$ tracking what makes $x_1 = \sin(kt + c)$ optimal.
+    r"""$\dot x_1 = x_2,\ \dot x_2 = -t x_1 + u$ with the target r for which $x_1 = \sin(kt + c)$ is
+    optimal.
 
     Written backwards: u from the second equation, $\lambda_2 = -u$, $\lambda_1$ and $r_2 = x_2$
     from $\dot\lambda_2 = -\lambda_1$, $r_1$ from $\dot\lambda_1 = -(x_1 - r_1) + t \lambda_2$. Its
@@ -37,9 +39,10 @@ def oscillator() -> Tracking:
 class Errors(NamedTuple):
     """Greatest errors of the costate at the nodes, relative to its greatest value.
 
-    - `raw`: multipliers over weights. `closed`: the null mode taken out (LGL only).
-    - `dual`: necessary conditions collocated. `gap`: between `closed` and that.
-    - `mode`: the multiple of P_N taken out. `closure`: of both ends, after it.
+    - `raw`: of multipliers over weights. `closed`: the same without the null mode (LGL only).
+    - `dual`: of the collocated necessary conditions. `gap`: between `closed` and `dual`.
+    - `mode`: the multiple of P_N that was subtracted. `closure`: miss of both closure conditions
+      after that.
     - `consistency`: residual of the dual problem where it has more equations than unknowns.
     """
 
@@ -53,7 +56,7 @@ class Errors(NamedTuple):
 
 
 def errors(family: str, points: int) -> Errors:
-    """Both ways around the diagram of figure 6, on one grid."""
+    """Errors of the costate both ways around the diagram of the review's figure 6, on one grid."""
     problem = oscillator()
     rule = collocation(family, points)
     ends = end_rows(rule, extrapolated=True)
@@ -75,7 +78,11 @@ def errors(family: str, points: int) -> Errors:
 def closed_costate(
     rule: Collocation, family: str, raw: np.ndarray, wanted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`raw` less the multiple of P_N that the closure conditions ask for, where a null mode is."""
+    """`raw` less the multiple of P_N that the closure conditions determine, and that multiple; zero
+    on grids without a null mode.
+
+    **Arguments:** `wanted` (2, n): the costate at both ends.
+    """
     if not len(rule.extra):
         return raw, np.zeros(raw.shape[1])
     v = left_null(family, len(rule.nodes)) / rule.w
@@ -87,8 +94,10 @@ def closed_costate(
 def dualised(rule: Collocation, problem: Tracking) -> tuple[np.ndarray, float]:
     """Dualise, then discretise: x and lambda collocated on the same grid, u = -b^T lambda.
 
-    On LGL these are more equations than unknowns; least squares then, and what remains is the
-    delta^N that problem B^{lambda N} grants. Returns lambda at the nodes and that residual.
+    On LGL there are more equations than unknowns. They are solved by least squares; the residual is
+    the delta^N by which problem B^{lambda N} is relaxed.
+
+    **Returns:** lambda at the nodes, and the largest residual.
     """
     n, P, C = len(problem.b), len(rule.support), len(rule.nodes)
     a, eye = problem.a(rule.nodes), np.eye(n)

@@ -1,11 +1,12 @@
-r"""Which weights W, W* pair with which grid: the discrete integration by parts behind Table 1.
+r"""Which weights W, W* pair with which grid: the discrete integration by parts behind the review's
+Table 1.
 
-With quadrature w that is exact, $\int W^* \phi_i \phi_j'/W^*_i$ by parts reads
+With an exact quadrature w, integrating $\int W^* \phi_i \phi_j'/W^*_i$ by parts gives
 
     $w_i D_{ij} + w_j D^*_{ji} = \delta_{i,+1} \delta_{ij} - \delta_{i,-1} \delta_{ij}$
 
-with $\delta_{i,\pm 1}$ marking a node at that end, where W* has no say. So an end that is no node
-must be one where W* = 0: the costate vanishes there, which is to say that the state is free.
+with $\delta_{i,\pm 1} = 1$ if node i is that end, where the value of W* does not matter. So W* must
+vanish at an end that is not a node: the costate vanishes there, which means that the state is free.
 """
 
 from collections.abc import Callable
@@ -24,14 +25,17 @@ WEIGHTS = {
 
 
 def weighted(x: np.ndarray, d: np.ndarray, weight: str) -> np.ndarray:
-    """Eq. (12) in NumPy, from the plain matrix `d` of nodes `x`; a test holds it to the library's
-    `weighted_differentiation_matrix`."""
+    """The weighted differentiation matrix in NumPy, from the plain matrix `d` of the nodes `x`; a
+    test holds it to the library's `weighted_differentiation_matrix`.
+
+    **Source:** Ross & Karpenko, review (2012), eq. (12).
+    """
     W, rate = WEIGHTS[weight]
     return W(x)[:, None] * d / W(x)[None] + np.diag(rate(x) / W(x))
 
 
 def by_parts_defect(family: str, weight: str, points: int) -> float:
-    """Greatest violation of the identity above, with W = 1 for the state and W* = `weight`."""
+    """Greatest violation of this module's identity, with W = 1 for the state and W* = `weight`."""
     own = grid(family, points)
     ends = np.diag((own.x == 1.0).astype(float) - (own.x == -1.0))
     dual = weighted(own.x, own.differentiation, weight)
@@ -40,12 +44,15 @@ def by_parts_defect(family: str, weight: str, points: int) -> float:
 
 
 def mapping_matrix(family: str, weight: str, points: int) -> tuple[np.ndarray, float]:
-    r"""Proposition 1: P with $\Lambda = P \tilde\Lambda$, column by column, from solutions alone.
+    r"""P of the review's Proposition 1, $\Lambda = P \tilde\Lambda$, column by column, from
+    solutions alone.
 
     Minimise $\int ((x - r)^2 + u^2)/2$ with $\dot x = t x + u$ and, where -1 is a node, x(-1)
-    fixed. For each unit vector r is made such that B^N has it for its multipliers; the column is
-    the costate of problem B^{lambda N} for that r, with D* of W* = `weight`. Returns P, and the
-    rounding of its entries: eps times the conditions of both solves and the size of 1/w.
+    fixed. For each unit vector, r is chosen so that the multipliers of B^N are that vector; the
+    column is the costate of problem B^{lambda N} for that r, with D* of W* = `weight`.
+
+    **Returns:** P, and the rounding of its entries: eps times the condition numbers of both solves
+    and the size of 1/w.
     """
     own = grid(family, points)
     x, w, d, n = own.x, own.w, own.differentiation, points
@@ -55,7 +62,7 @@ def mapping_matrix(family: str, weight: str, points: int) -> tuple[np.ndarray, f
     states = np.linalg.solve(f, u)
     r = states + f.T @ M / w[:, None]  # w (x - r) + f^T M = 0, no force at a fixed start
 
-    # Where the start is fixed, the costate equation there is what B^N does not impose.
+    # Where the start is fixed, problem B^N does not impose the costate equation there.
     held = np.flatnonzero(x == -1.0)
     rows = np.delete(np.arange(n), held)
     dual = weighted(x, d, weight) + np.diag(x)

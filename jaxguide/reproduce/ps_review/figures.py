@@ -1,4 +1,4 @@
-"""Figures 4, 5, 7, 8 and 9 of the review, and the rates."""
+"""Figures 4, 5, 7, 8 and 9 of the review, its figure 6 in numbers, and rates of convergence."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from jaxguide.spectral.grids import evaluation
 
 
 def write_figures(out: Path) -> list[str]:
-    """Draws them, and returns the paths."""
+    """Writes the figures to the folder `out` and returns their paths."""
     figures = {
         "fig4-lagrange": interpolant(False),
         "fig5-weighted": interpolant(True),
@@ -21,19 +21,20 @@ def write_figures(out: Path) -> list[str]:
         "fig7-uniform-10": uniform_control(10),
         "fig8-uniform-12": uniform_control(12),
         "fig9-gaussian": gaussian_controls(),
-        "rates": convergence(),
+        "rates": rate_plot(),
     }
     return [plot.save(figures[name], out / f"ps-review-{name}.png") for name in figures]
 
 
 def axes(rows: int, columns: int, height: float, width: float = 0.72) -> Any:
+    """A figure `height` inches high and `width` of a page wide, and its axes by row and column."""
     figure = Figure(figsize=(plot.WIDTH * width, height))
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
 @plot.styled
 def interpolant(with_weight: bool) -> Any:
-    """Figure 4: phi_2 on an arbitrary grid; figure 5: W/W_2 phi_2."""
+    """Review, figure 4: phi_2 on an arbitrary grid; with a weight, figure 5: W/W_2 phi_2."""
     figure, ((axis,),) = axes(1, 1, 2.6)
     x, j = weighted.ARBITRARY, weighted.CHOSEN
     t = np.linspace(-1, 1, 401)
@@ -54,9 +55,9 @@ def interpolant(with_weight: bool) -> Any:
 
 @plot.styled
 def uniform_control(points: int) -> Any:
-    """Figures 7 and 8: E1 on a uniform grid. Unbounded, it is shown with u <= 10."""
+    """Review, figures 7 and 8: E1 on a uniform grid; where it is unbounded, with u <= 10."""
     figure, ((axis,),) = axes(1, 1, 2.6)
-    found = uniform.solve(points)
+    found = uniform.solve_e1(points)
     t, fine = found.x + 1, np.linspace(0, 2, 401)
     u, text = found.u, "nodes"
     if u is None:
@@ -79,16 +80,16 @@ def uniform_control(points: int) -> Any:
 
 @plot.styled
 def gaussian_controls() -> Any:
-    """Figure 9: E2 on three grids of 10 points, and with the ends extrapolated."""
+    """Review, figure 9: E2 on three grids of 10 points, and with the ends extrapolated."""
     figure, (row,) = axes(1, 3, 2.5, 1.15)
     for axis, family, title in zip(
         row, ("lg", "lgr-left", "lgl"), ("Gauss", "Gauss-Radau", "Gauss-Lobatto"), strict=True
     ):
-        found = gaussian.solve(family, 10)
+        found = gaussian.solve_e2(family, 10)
         axis.plot([0, 1], [1, 1], label="optimal", **plot.line(0))
         axis.plot(found.t, found.u, "o:", color=plot.COLOURS[2], label="ends at nodes")
         if family != "lgl":
-            other = gaussian.solve(family, 10, extrapolated=True)
+            other = gaussian.solve_e2(family, 10, extrapolated=True)
             axis.plot(other.t, other.u, "s", mfc="none", color=plot.COLOURS[1],
                       label="ends extrapolated")  # fmt: skip
         axis.set_title(f"{title}: error {found.error:.1g}")
@@ -101,7 +102,7 @@ def gaussian_controls() -> Any:
 
 @plot.styled
 def diagram() -> Any:
-    """Figure 6 in numbers: errors of the costate both ways around."""
+    """Review, figure 6 in numbers: errors of the costate both ways around the diagram."""
     figure, (row,) = axes(1, 3, 2.6, 1.15)
     sizes = np.arange(5, 31)
     for axis, (family, title) in zip(
@@ -124,8 +125,8 @@ def diagram() -> Any:
 
 
 @plot.styled
-def convergence() -> Any:
-    """Errors against N and the promised slopes."""
+def rate_plot() -> Any:
+    """Errors against the number of points, and the slopes that the theorems promise."""
     figure, ((left, right),) = axes(1, 2, 2.8, 1.0)
     sizes = np.array(rates.SIZES)
     for i, m in enumerate((2, 3, 4, None)):

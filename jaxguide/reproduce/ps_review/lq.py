@@ -1,6 +1,7 @@
-"""Linear-quadratic problems on one segment: problem B^N as one linear system. NumPy only.
+"""Linear-quadratic problems on one segment: the review's problem B^N as one linear system.
 
-With cost and costate mapped as in the review's section 4.1, tau on [-1, 1] is the time.
+Time is tau on [-1, 1]; cost and costate are mapped as in Ross & Karpenko, review (2012), section
+4.1. NumPy only.
 """
 
 import dataclasses
@@ -52,21 +53,23 @@ class Discrete(NamedTuple):
 
 
 def review_grid(family: str, points: int) -> Collocation:
-    """The review's own B^N: state, control and dynamics at every node, and at no other point."""
+    """The review's own problem B^N, eq. (21): state, control and dynamics at every node, and at no
+    other point, whichever ends are nodes."""
     own = grid(family, points)
     rows, eye = np.arange(points), np.eye(points)
     return Collocation(own.x, own.x, 0, own.w, own.differentiation, eye, rows, rows[:0])
 
 
 def end_rows(rule: Collocation, extrapolated: bool) -> np.ndarray:
-    """(2, P): the state at both ends, or that at the first and last node taken for it."""
+    """Rows (2, P) by which values at the support points give the state at both ends: those of the
+    interpolant if `extrapolated`, else those of the first and last node."""
     if extrapolated:
         return evaluation(rule.support, np.array([-1.0, 1.0]))
     return np.eye(len(rule.support))[[0, -1]]
 
 
-class System(NamedTuple):
-    """B^N in z = (X, U): z^T H z / 2 + cost^T z is minimised, G z = right."""
+class QuadraticProgram(NamedTuple):
+    """Problem B^N in z = (X, U): minimise z^T H z / 2 + cost^T z subject to G z = right."""
 
     H: np.ndarray
     cost: np.ndarray
@@ -74,8 +77,12 @@ class System(NamedTuple):
     right: np.ndarray
 
 
-def assemble(rule: Collocation, problem: Tracking, ends: np.ndarray) -> System:
-    """Defects A X - B F = 0, then end conditions `ends` X = x(-1), x(1) where fixed."""
+def quadratic_program(rule: Collocation, problem: Tracking, ends: np.ndarray) -> QuadraticProgram:
+    """Problem B^N of `problem`: rows of defects A X - B F = 0, then of end conditions `ends` X =
+    x(-1), x(1) where these are fixed.
+
+    **Arguments:** `ends`: of `end_rows`.
+    """
     n, P, C = len(problem.b), len(rule.support), len(rule.nodes)
     eye, own = np.eye(n), slice(rule.first, rule.first + C)
     fx = np.einsum("rp,ij->ripj", rule.A, eye)  # of the defects by X
@@ -93,21 +100,23 @@ def assemble(rule: Collocation, problem: Tracking, ends: np.ndarray) -> System:
     by_state = np.outer(ends[1], problem.end_cost) - w[:, None] * target
     H = np.diag(np.concatenate([np.repeat(w, n), rule.w]))
     right = [np.zeros(len(rule.A) * n), *(problem.end(i) for i in held)]
-    return System(H, np.append(by_state, np.zeros(C)), G, np.concatenate(right))
+    return QuadraticProgram(H, np.append(by_state, np.zeros(C)), G, np.concatenate(right))
 
 
 def discretise(rule: Collocation, problem: Tracking, ends: np.ndarray) -> Discrete:
-    """Discretise, then dualise: the KKT system of B^N, one linear solve."""
+    """Discretise, then dualise: the KKT system of problem B^N, one linear solve."""
     n, P = len(problem.b), len(rule.support)
-    z, y = kkt(*assemble(rule, problem, ends))
+    z, y = kkt(*quadratic_program(rule, problem, ends))
     defect, end = np.split(y, [len(rule.A) * n])
     both = np.zeros((2, n))
     both[[i for i in (0, 1) if problem.fixed[i]]] = end.reshape(-1, n)
     return Discrete(z[: P * n].reshape(P, n), z[P * n :], defect.reshape(-1, n), both)
 
 
-def objective(rule: Collocation, problem: Tracking, found: Discrete, ends: np.ndarray) -> float:
-    """The discrete cost."""
+def discrete_objective(
+    rule: Collocation, problem: Tracking, found: Discrete, ends: np.ndarray
+) -> float:
+    """The cost of problem B^N at the point `found`."""
     off = found.x[rule.first : rule.first + len(rule.nodes)] - problem.target(rule.nodes)
     running = (np.sum(off**2, axis=1) + found.u**2) / 2
     return float(rule.w @ running + problem.end_cost @ (ends[1] @ found.x))

@@ -1,7 +1,8 @@
-"""Numbers and statements of the 2012 review, and of a reference computed without this package.
+"""Numbers and statements of Ross & Karpenko, review (2012), and numbers of a reference computed
+without this package.
 
-The review prints figures, Table 1 and rates, and hardly a number. The reference counts points in
-"N", as the review's E1 and E2 do.
+The review prints figures, Table 1 and rates, but few numbers. The reference's "N" is the number of
+points, as in the review's E1 and E2.
 """
 
 # E1 on uniform grids, section 4.2.2: the review says that all weights are positive at 10 points,
@@ -23,20 +24,20 @@ CONTROL_ERRORS = {
 # Table 1: weight W, grid, boundary conditions.
 TABLE_1 = {"lgl": ("1", "any"), "lgr-left": ("1-t", "fixed-free"), "lg": ("1-t^2", "free-free")}
 
-# Infinite-horizon regulator: order of the error of J by points (reference).
+# Infinite-horizon regulator: order of magnitude of the error of J by points (reference).
 INFINITE = {10: 1e-5, 20: 1e-10, 40: 1e-14}
 
 
 def residual_rate(m: int) -> float:
-    """Theorem 2: delta^N = (N - 1)^(3/2 - m)."""
+    """Exponent of N - 1 in the residual delta^N of a state in W^{m,inf}: review, Theorem 2."""
     return 1.5 - m
 
 
 def state_rate(m: int) -> float:
-    """Theorem 2: |x_i - x(t_i)| <= L (N - 1)^(1 - m)."""
+    """Exponent of N - 1 in the bound of |x_i - x(t_i)|: review, Theorem 2."""
     return 1.0 - m
 
 
 def cost_rate(m: int) -> float:
-    """Kang, as section 4.3 quotes him: the cost converges as N^(1 - 2m/3)."""
+    """Exponent of N in the error of the cost: Kang, quoted in the review, section 4.3."""
     return 1.0 - 2.0 * m / 3.0

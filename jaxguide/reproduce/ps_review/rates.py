@@ -1,30 +1,31 @@
-r"""Rates of convergence on LGL: Theorem 2 (feasibility) and Kang's rate of the cost (section 4.3).
+r"""Rates of convergence on LGL: Theorem 2 (feasibility) and Kang's rate of the cost, both in Ross &
+Karpenko, review (2012), section 4.3.
 
 Each state is smooth but for one jump of its derivative of order m, so it is in $W^{m,\infty}$:
-$x = \sin 2t + \operatorname{sgn}(t - c) (t - c)^m$. To have it optimal, the jump is put into the
-running cost; `Saturated` has smooth data, and a control that leaves its bound.
+$x = \sin 2t + \operatorname{sgn}(t - c) (t - c)^m$. For it to be optimal, the running cost has the
+jump too; `Saturated` has smooth data, and a control that leaves its bound.
 """
 
 import numpy as np
 
 from jaxguide.reproduce.ps_review.lq import (
     Tracking,
-    assemble,
+    discrete_objective,
     discretise,
     end_rows,
-    objective,
+    quadratic_program,
     review_grid,
 )
-from jaxguide.reproduce.ps_review.qp import minimise
+from jaxguide.reproduce.ps_review.qp import solve_qp
 from jaxguide.spectral import nodes_lg
 from jaxguide.spectral.grids import grid
 
-KINK = 0.2718281828  # at no node of any grid used
-SIZES = (8, 11, 16, 23, 32, 45, 64, 91, 128)  # points
+KINK = 0.2718281828  # c: not a node of any grid used
+SIZES = (8, 11, 16, 23, 32, 45, 64, 91, 128)  # points: powers of sqrt 2
 
 
 def path(t: np.ndarray, m: int | None, order: int = 0) -> np.ndarray:
-    """The derivative of x of that order; m = None is smooth."""
+    """The derivative of x of that `order` at `t`, for a jump of order `m`; None: no jump."""
     smooth = 2.0**order * np.sin(2 * t + order * np.pi / 2)
     if m is None:
         return smooth
@@ -34,23 +35,25 @@ def path(t: np.ndarray, m: int | None, order: int = 0) -> np.ndarray:
 
 
 def feasible(points: int, m: int | None) -> tuple[float, float]:
-    r"""Theorem 2 for $\dot x = u$: least residual delta^N, and max |x_i - x(t_i)| at it.
+    r"""Review, Theorem 2, for $\dot x = u$: the least residual delta^N, and max |x_i - x(t_i)| with
+    that residual.
 
-    With u_i = u(t_i) the equations D X = u are one too many: v^T u, v^T D = 0, must vanish. The
-    least max-norm of the residual is |v^T u| / |v|_1, reached by delta sign(v).
+    With u_i = u(t_i) the equations D X = u are one too many: they have a solution only if v^T u = 0
+    for the v with v^T D = 0. The least max-norm of the residual is delta = |v^T u| / |v|_1, with
+    the residual delta sign(v).
     """
     own = grid("lgl", points)
     u = path(own.x, m, 1)
     v = own.w * np.polynomial.legendre.legval(own.x, np.eye(points)[-1])
     delta = v @ u / np.sum(np.abs(v))
-    # The interpolant of what is left has degree N - 1, so that D differentiates its integral.
+    # The interpolant of u less the residual has degree N - 1, so D differentiates its integral.
     x = own.integration @ (u - delta * np.sign(v))
     off = x + path(own.x[:1], m) - path(own.x, m)
     return abs(float(delta)), float(np.max(np.abs(off)))
 
 
 def tracking(m: int | None) -> Tracking:
-    r"""$\dot x = u$ tracking r = x - x'', which makes `path` optimal."""
+    r"""$\dot x = u$ tracking $r = x - \ddot x$, for which `path` is optimal."""
     column = lambda order, sign: lambda t: sign * path(t, m, order)[:, None]
     return Tracking(
         a=lambda t: np.zeros((len(t), 1, 1)), b=np.ones(1),
@@ -61,11 +64,11 @@ def tracking(m: int | None) -> Tracking:
 
 
 def optimal(points: int, m: int | None) -> tuple[float, float, float]:
-    """Errors of J, of x and of u (greatest at the nodes) of the optimal solution of B^N."""
+    """Errors of J, of x and of u (the greatest at the nodes) of the solution of problem B^N."""
     problem, rule = tracking(m), review_grid("lgl", points)
     ends = end_rows(rule, extrapolated=False)
     found = discretise(rule, problem, ends)
-    value = objective(rule, problem, found, ends)
+    value = discrete_objective(rule, problem, found, ends)
     off = lambda y, z: float(np.max(np.abs(y - z)))
     return (
         abs(value - exact(m)),
@@ -75,9 +78,11 @@ def optimal(points: int, m: int | None) -> tuple[float, float, float]:
 
 
 class Saturated:
-    r"""$\int_{-1}^1 (x^2 + u^2)/2\,dt$, $\dot x = u$, |u| <= 1, from where u leaves -1 at t = c.
+    r"""$\int_{-1}^1 (x^2 + u^2)/2\,dt$, $\dot x = u$, |u| <= 1; the start is such that u leaves -1
+    at t = c.
 
-    After that u = -tanh(1 - t) x (Riccati). u has a corner, so that x is in $W^{2,\infty}$.
+    After that u = -tanh(1 - t) x (Riccati equation). u has a corner, so that x is in
+    $W^{2,\infty}$.
     """
 
     m = 2
@@ -86,11 +91,13 @@ class Saturated:
 
     @classmethod
     def state(cls, t: np.ndarray) -> np.ndarray:
+        """The optimal x at the times `t`."""
         later = cls.at_corner * np.cosh(1 - t) / np.cosh(1 - KINK)
         return np.where(t < KINK, cls.start - (t + 1), later)
 
     @classmethod
     def value(cls) -> float:
+        """The optimal J."""
         until = (cls.start**3 - cls.at_corner**3) / 3 + (KINK + 1)
         return float(until + cls.at_corner**2 * np.tanh(1 - KINK)) / 2
 
@@ -102,10 +109,10 @@ class Saturated:
         problem = Tracking(lambda t: np.zeros((len(t), 1, 1)), np.ones(1), zero, state,
                            zero, zero, np.zeros(1))  # fmt: skip
         rule = review_grid("lgl", points)
-        system = assemble(rule, problem, end_rows(rule, extrapolated=False))
+        system = quadratic_program(rule, problem, end_rows(rule, extrapolated=False))
         upper = np.concatenate([np.full(points, np.inf), np.ones(points)])
-        found = minimise(*system, -upper, upper)
-        if found.violation > 1e-9:
+        found = solve_qp(*system, -upper, upper)
+        if found.violation > 1e-9:  # of order 1 where the active set has not settled
             return np.nan, np.nan
         x = found.z[:points]
         value = found.z @ system.H @ found.z / 2
@@ -113,8 +120,8 @@ class Saturated:
 
 
 def exact(m: int | None) -> float:
-    """J of the path: Gauss quadrature on either side of the jump."""
-    points, w = nodes_lg(40)
+    """J of `path`, by Gauss quadrature on either side of the jump."""
+    points, w = nodes_lg(40)  # exact to rounding for these integrands
     value = -float(path(np.ones(1), m, 1)[0] * path(np.ones(1), m)[0])
     for a, b in ((-1.0, KINK), (KINK, 1.0)):
         t = (a + b) / 2 + (b - a) / 2 * points
@@ -123,5 +130,5 @@ def exact(m: int | None) -> float:
 
 
 def slope(sizes: tuple[int, ...], errors: np.ndarray) -> float:
-    """Of the regression of log error on log(N - 1), N the review's degree: points less one."""
+    """Slope of the regression of log error on log(N - 1), with the review's N, points less one."""
     return float(np.polyfit(np.log(np.array(sizes) - 2), np.log(errors), 1)[0])

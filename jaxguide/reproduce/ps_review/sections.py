@@ -1,4 +1,4 @@
-"""The report's sections: each computes, and judges against its reference or what theory says."""
+"""The report's sections: each computes, and judges against its reference or against theory."""
 
 import numpy as np
 
@@ -30,6 +30,7 @@ NAMES = {"lgl": "LGL", "lgr-left": "LGR", "lgr-right": "LGR (+1)", "lg": "LG", "
 
 
 def interpolants(report: Report) -> None:
+    """Review, eqs. (10)-(16), figures 4 and 5."""
     section = report.section(
         "Weighted interpolants (eqs 10-16; figures 4 and 5)",
         "By the library's matrices, on 8 arbitrary points (the paper prints none, nor its W; here "
@@ -66,6 +67,7 @@ def interpolants(report: Report) -> None:
 
 
 def uniform_grids(report: Report) -> None:
+    """Review, problem E1, figures 7 and 8."""
     section = report.section(
         "E1 on uniform grids (figures 7 and 8)",
         "A linear program, solved as it stands by HiGHS (scipy) and in closed form: minimise w.u "
@@ -77,7 +79,7 @@ def uniform_grids(report: Report) -> None:
         "9 points have negative weights and 10 have none.",
     )
     for points in range(8, 17):
-        found = uniform.solve(points)
+        found = uniform.solve_e1(points)
         printed = {} if points != POSITIVE_POINTS else {"printed": 0}
         reference = LEAST_WEIGHT.get(points)
         digits = {} if reference is None else {"tolerance": 5e-4 if points == 12 else 5e-5}
@@ -119,19 +121,20 @@ CASES = (  # family, ends extrapolated, weight
 
 
 def gaussian_grids(report: Report) -> None:
+    """Review, problem E2, figure 9."""
     section = report.section(
         "E2 on Gaussian grids of 10 points (figure 9)",
         "One quadratic program each, by a primal-dual active-set method whose last step is a dense "
         "KKT solve. max |u - 1|: 1 is the bound itself. Where e(x_0, x_N) is taken at the first "
         "and last node though these are no ends, the interpolant is free beyond them: the control "
         "runs into its bounds, and with -1 no node the problem is not even convex (curvature < 0; "
-        "what is found meets the first-order conditions). "
-        "With the ends extrapolated LGR and LG are as good as LGL with W = 1; what the paper says "
-        "of W = 1 is true of its B^N, which has x_0 and x_N in e. W = 1 - t is no cure: x_2 and "
-        "x_1 then vanish at the end, and no point within the bounds is left.",
+        "the point found meets the first-order conditions). "
+        "With the ends extrapolated LGR and LG are as good as LGL with W = 1; the paper's "
+        "statement on W = 1 is true of its B^N, which has x_0 and x_N in e. W = 1 - t is no cure: "
+        "x_2 and x_1 then vanish at the end, and no point within the bounds is left.",
     )
     for family, extrapolated, weight in CASES:
-        found = gaussian.solve(family, 10, extrapolated, weight)
+        found = gaussian.solve_e2(family, 10, extrapolated, weight)
         how = "extrapolated" if extrapolated else "first and last node"
         name = f"{NAMES[family]}, ends: {how}, W = {weight}"
         reference = CONTROL_ERRORS.get((family, extrapolated))
@@ -151,6 +154,7 @@ def gaussian_grids(report: Report) -> None:
 
 
 def table_1(report: Report) -> None:
+    """Review, Table 1."""
     section = report.section(
         "Table 1: which weight, which grid, which ends",
         "W = 1 for the state throughout; W* of the costate decides. Discrete integration by parts, "
@@ -194,14 +198,16 @@ def table_1(report: Report) -> None:
 
 
 def covector_mapping(report: Report) -> None:
+    """Review, figure 6, eqs. (23)-(25), Proposition 1, Remark 3."""
     section = report.section(
         "The covector mapping diagram (figure 6; eqs 23-25; Proposition 1)",
-        "x1' = x2, x2' = -t x1 + u, tracking what makes x1 = sin(3t + 0.4) optimal; errors of both "
-        "costates relative to the greatest. Discretise, then dualise: -multiplier/weight, raw, and "
-        "for LGL less the null mode gamma P_N fixed by both closure conditions. Dualise, then "
-        "discretise: state and costate equations collocated, u from H_u = 0 (LGL: one equation "
-        "more than unknowns for each, by least squares; what remains is delta^N). The two ways "
-        "around agree to rounding at all n on LG and spectrally on LGR and LGL.",
+        "x1' = x2, x2' = -t x1 + u, with the target for which x1 = sin(3t + 0.4) is optimal; "
+        "errors of both costates relative to the greatest. Discretise, then dualise: "
+        "-multiplier/weight, raw, and for LGL less the null mode gamma P_N fixed by both closure "
+        "conditions. Dualise, then discretise: state and costate equations collocated, u from "
+        "H_u = 0 (LGL: one equation more than unknowns for each, by least squares; the residual is "
+        "delta^N). The two ways around agree to rounding at all n on LG and spectrally on LGR and "
+        "LGL.",
     )
     for family in ("lgl", "lgr-right", "lg"):
         for points in (8, 12, 16, 24):
@@ -231,7 +237,8 @@ def _null_mode(report: Report) -> None:
         "method ends at a corner of it. The closure condition lambda(2) = 1 leaves gamma = 0. "
         "The paper's other method, Chebyshev (Remark 3), on the oscillator above: Clenshaw-Curtis "
         "weights integrate exactly to degree N only, the integration by parts of Table 1 fails, "
-        "and what B^N gives, multipliers over weights and controls alike, converges about as n^-2.",
+        "and the solution of B^N, multipliers over weights and controls alike, converges about as "
+        "n^-2.",
     )
     for points in (10, 20):
         raw, closed = uniform.lobatto_costate(points)
@@ -266,15 +273,16 @@ def _proposition_1(report: Report) -> None:
 
 
 def infinite_horizon(report: Report) -> None:
+    """Review, eq. (6), and W = 1 - t of Table 1."""
     section = report.section(
         "An infinite horizon: LGR, W = 1 - t, bilinear map (eq. 6)",
         "x' = x + u, cost x^2 + u^2, x(0) = 1: J = 1 + sqrt 2 = 2.41421356... Here W = 1 does as "
         "well, since the running cost drives x to 0 at the end by itself. The reference gives "
-        "orders of magnitude: judged to half a decade, and what is below 1e-14 counts as 1e-14.",
+        "orders of magnitude: judged to half a decade; below 1e-14 counts as 1e-14.",
     )
     for points, reference in INFINITE.items():
-        error = infinite.cost(points) - infinite.VALUE
-        plain = infinite.cost(points, "1") - infinite.VALUE
+        error = infinite.regulator_cost(points) - infinite.VALUE
+        plain = infinite.regulator_cost(points, "1") - infinite.VALUE
         section.add(
             f"{points} points: log10 of the error of J", np.log10(max(abs(error), 1e-14)),
             np.log10(reference), tolerance=0.5, note=f"{error:.2e}; with W = 1: {plain:.2e}",
@@ -282,15 +290,16 @@ def infinite_horizon(report: Report) -> None:
 
 
 def convergence(report: Report) -> None:
+    """Review, section 4.3: Theorem 2, and Kang's rate of the cost."""
     section = report.section(
         "Rates: Theorem 2, and Kang's for the cost (section 4.3)",
         "x' = u on LGL, 8 to 128 points. x = sin 2t + sgn(t-c) (t-c)^m is in W^{m,inf}. Slopes of "
         "log error over log(N - 1). Theorem 2: u_i = u(t_i), the least residual delta^N of B^N "
         "(closed form) and the state's error at it. The optimal solutions: of the problem that "
-        "tracks what makes x optimal, which puts the jump into the running cost where the theorems "
-        "ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, whose control "
-        "has a corner. The promised rates are bounds: a slope passes when it is no flatter. "
-        "Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
+        "tracks the target for which x is optimal, so that the running cost has the jump, where "
+        "the theorems ask for smooth data; and, with smooth data, of x^2 + u^2 with |u| <= 1, "
+        "whose control has a corner. The promised rates are bounds: a slope passes when it is no "
+        "flatter. Theorem 6 promises convergence and no rate; the measured ones beat the bounds.",
     )
     for m in (2, 3, 4):
         errors = np.array([rates.feasible(n, m) + rates.optimal(n, m) for n in rates.SIZES])

@@ -1,4 +1,5 @@
-"""Weighted interpolants, eqs (10)-(16), by the library's own matrices."""
+"""Weighted interpolants, Ross & Karpenko, review (2012), eqs. (10)-(16), by the library's own
+matrices."""
 
 import jax
 import jax.numpy as jnp
@@ -15,27 +16,32 @@ from jaxguide.spectral.grids import evaluation
 _matrix = jax.jit(weighted_differentiation_matrix, static_argnums=1)
 _quadrature = jax.jit(weighted_quadrature, static_argnums=1)
 
-# An arbitrary grid of N = 7 (the paper prints none); no end is a node, so any W of Table 1 will do.
+# An arbitrary grid of 8 points (the paper prints none); no end is a node, so any W of Table 1 will
+# do.
 ARBITRARY = np.array([-0.93, -0.66, -0.41, -0.02, 0.23, 0.49, 0.71, 0.9])
-CHOSEN = 2  # of figures 4 and 5
+CHOSEN = 2  # the basis function of the review's figures 4 and 5
 
 
 def decaying(t: jax.Array) -> jax.Array:
+    """W = 1 - t, which vanishes at +1."""
     return 1 - t
 
 
 def constant(t: jax.Array) -> jax.Array:
+    """W = 1."""
     return jnp.ones_like(t)
 
 
 def basis(query: np.ndarray, weighted: bool) -> np.ndarray:
-    """(q, n): W(t)/W(t_j) phi_j(t) on the arbitrary grid, W = 1 - t or 1."""
+    """W(t)/W(t_j) phi_j(t) at the points `query`, shape (q, n), on the arbitrary grid; W = 1 - t if
+    `weighted`, else 1."""
     out = evaluation(ARBITRARY, query)
     return out * (1 - query[:, None]) / (1 - ARBITRARY) if weighted else out
 
 
 def matrix_defects() -> dict[str, float]:
-    """How far the library's matrices are from what eqs (11), (12) and (16) say, on ARBITRARY."""
+    """Errors of the library's matrices against the review's eqs. (11), (12) and (16), by name, on
+    the grid ARBITRARY."""
     x, n = ARBITRARY, len(ARBITRARY)
     D = np.asarray(_matrix(x, decaying))
     plain = np.asarray(_matrix(x, constant))
@@ -59,7 +65,7 @@ def matrix_defects() -> dict[str, float]:
 
 
 def radau_weights(points: int) -> float:
-    """max |w of eq. (16) with W = 1 - t, minus the Radau weights|."""
+    """max |w - Radau weights|, with w of the review's eq. (16) for W = 1 - t."""
     x, gauss = nodes_lgr(points)
     return float(np.max(np.abs(np.asarray(_quadrature(x, decaying)) - gauss)))
 
