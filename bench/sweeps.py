@@ -33,7 +33,7 @@ import json, sys
 import jax
 jax.config.update("jax_enable_x64", True)
 import jaxguide as jg
-import jaxguide.montecarlo.sweep
+import jaxguide.sweeping.sweep
 jax.devices()
 # Linux; getrusage would count the parent's size before exec.
 lines = lambda: open("/proc/self/status").read().splitlines()

@@ -39,7 +39,7 @@ def export(store: Any, out: Any) -> Path:
         raise ValueError(
             f"export: {out.name!r} ends in {out.suffix!r}; choose one of {', '.join(_WRITERS)}."
         )
-    told = stores.described(store)
+    told = stores.attributes_of(store)
     out.parent.mkdir(parents=True, exist_ok=True)
     beside = out.with_name(f".{out.name}.partial{out.suffix}")
     try:
@@ -79,7 +79,7 @@ def _named(name: str, values: np.ndarray) -> Any:
 
 
 def _csv(store: Path, told: dict[str, Any], out: Path) -> None:
-    data = stores.opened(store)
+    data = stores.open_store(store)
     found = columns(data)
     with out.open("w", newline="", encoding="utf-8") as stream:
         lines = csv.writer(stream)
@@ -91,7 +91,7 @@ def _csv(store: Path, told: dict[str, Any], out: Path) -> None:
 
 
 def _json(store: Path, told: dict[str, Any], out: Path) -> None:
-    data = stores.opened(store)
+    data = stores.open_store(store)
     with out.open("w", encoding="utf-8") as stream:
         stream.write("{")
         for name in ("sweep", "about", "summary"):
@@ -121,7 +121,7 @@ def _optional(module: str, form: str) -> Any:
 
 def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
     pa, parquet = _optional("pyarrow", "Parquet"), _optional("pyarrow.parquet", "Parquet")
-    data = stores.opened(store)
+    data = stores.open_store(store)
     found = columns(data)
     rest = {k: json.dumps(told.get(k)) for k in ("sweep", "about", "summary")}
     writer = None
@@ -143,7 +143,7 @@ def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
 
 def _netcdf(store: Path, told: dict[str, Any], out: Path) -> None:
     _optional("h5netcdf", "netCDF")
-    data = stores.opened(store)
+    data = stores.open_store(store)
     text = {k: json.dumps(stores.plain(v)) for k, v in data.attrs.items()}
     data = data.assign_attrs(text).assign_coords(
         state=[str(s) for s in data["state"].values],

@@ -54,9 +54,9 @@ def compare(a: Path, b: Path, *, quantity: str = "miss", common: Common = Common
         What to compare: "miss", "final_time", or a state at the end.
     """
     from jaxguide.sweeping.compare import compare as paired
-    from jaxguide.sweeping.store import opened
+    from jaxguide.sweeping.store import open_store
 
-    data = paired(opened(a), opened(b), quantity)
+    data = paired(open_store(a), open_store(b), quantity)
     table = Table("", "", box=None, show_header=False)
     for key, value in data.items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)

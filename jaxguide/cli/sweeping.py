@@ -132,10 +132,10 @@ def options_of_xla(command: Any, arguments: dict[str, Any]) -> None:
     if command is sweep:
         flags.set_for_flights()
     elif command is rerun:
-        from jaxguide.sweeping.store import described
+        from jaxguide.sweeping.store import attributes_of
 
         with contextlib.suppress(ValueError):  # which the command itself will tell
-            flags.take(described(arguments["store"])["sweep"].get("xla", ""))
+            flags.take(attributes_of(arguments["store"])["sweep"].get("xla", ""))
 
 
 @sweeps.command

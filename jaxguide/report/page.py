@@ -33,13 +33,13 @@ def write(store: Path, out: Path | None = None) -> Path:
 
 def html(store: Path) -> str:
     """The report as one HTML text: figures inside, no script, nothing to be fetched."""
-    told = stores.described(store)
+    told = stores.attributes_of(store)
     if "summary" not in told:
         raise ValueError(
             f"{store} holds a sweep that was not flown to its end; go on with the same command "
             "and --resume."
         )
-    data = stores.opened(store)
+    data = stores.open_store(store)
     manifest, attrs = told["sweep"], data.attrs
     cases = figures.shown_cases(data)
     name = manifest.get("label") or attrs["about"]["plant"]["class"]
@@ -51,7 +51,7 @@ def html(store: Path) -> str:
         _percentiles(attrs),
         _section(
             "How the ends are spread",
-            drawn(figures.histograms, attrs, stores.histograms(store), title="histograms"),
+            drawn(figures.histograms, attrs, stores.total_histograms(store), title="histograms"),
             "All successful flights, less the undispersed one; lines at the 1st, 50th and 99th "
             "percentiles.",
         ),

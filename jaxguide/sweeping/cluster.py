@@ -31,7 +31,7 @@ def over_workers(
         raise RuntimeError(
             "a sweep on a cluster needs Dask; install it with pip install 'jaxguide[sweep]'."
         ) from e
-    from jaxguide.montecarlo.station import fly, stationed
+    from jaxguide.sweeping.station import fly, stationed
 
     with _client(distributed, scheduler) as client, stationed(client, order) as name:
         submit = lambda k: client.submit(

@@ -10,7 +10,7 @@ from jaxtyping import Array
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, simulate
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import apply, draw, shared
+from jaxguide.montecarlo.rollouts import draw, shared, with_deviations
 from jaxguide.tuning.measures import endpoint_miss
 
 Measure = Callable[[Mission, Flight], Any]
@@ -48,8 +48,8 @@ class Flown(eqx.Module):
 
         def fly(key: Array) -> Any:
             k_draw, k_noise = jax.random.split(key)
-            flown = apply(mission, draw(mission, self.dispersions, k_draw))
-            return self.measure(flown, simulate(flown, k_noise, self.save, prepared))
+            deviated = with_deviations(mission, draw(mission, self.dispersions, k_draw))
+            return self.measure(deviated, simulate(deviated, k_noise, self.save, prepared))
 
         again = jax.checkpoint(fly)  # pyright: ignore[reportPrivateImportUsage]
         return jax.lax.map(again, keys, batch_size=self.chunk)
