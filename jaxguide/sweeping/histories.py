@@ -58,7 +58,7 @@ def in_full(order: Order, cases: np.ndarray) -> dict[str, tuple[tuple[str, ...],
 
 def program_in_full(order: Order) -> str:
     """StableHLO text of the program of `in_full`: lowered, not compiled."""
-    return lowered(_fly_in_full, *_arguments(order), jnp.zeros(_LANES, jnp.result_type(int)))
+    return lowered(_fly_in_full, *_arguments(order), jnp.asarray(np.zeros(_LANES, np.int64)))
 
 
 def _arguments(order: Order) -> tuple:

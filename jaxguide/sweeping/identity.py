@@ -108,6 +108,8 @@ def _digest_of_sums() -> str:
 def _texts(value: Any, above: tuple[int, ...]) -> Iterator[str]:
     """`value` as lines of text, the same in every process. `above`: the identities of the objects
     that `value` lies in, some of which a function may hold itself."""
+    if callable(value) and not isinstance(value, type):
+        value = inspect.unwrap(value)  # of `jax.jit`, say
     if id(value) in above:
         yield "itself"
         return
@@ -133,8 +135,8 @@ def _texts(value: Any, above: tuple[int, ...]) -> Iterator[str]:
         yield from _texts((value.func, value.args, value.keywords), above)
     elif isinstance(value, type):
         yield from _of_class(value)
-    elif callable(value) and hasattr(inspect.unwrap(value), "__qualname__"):
-        yield from _of_function(inspect.unwrap(value), above)
+    elif callable(value) and hasattr(value, "__qualname__"):
+        yield from _of_function(value, above)
     elif type(value).__repr__ is object.__repr__:  # which would show its address
         yield from _of_class(type(value))
         yield from _texts(getattr(value, "__dict__", {}), above)

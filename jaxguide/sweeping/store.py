@@ -4,8 +4,8 @@ resumed. Host only.
 Cases lie in the root group, so that `xr.open_zarr` shows them and nothing else. The group `partial`
 holds each tile's moments, each chunk's histogram and, written last, the digest of the chunk: a
 chunk is used only if its digest is present and right. Zarr replaces whole files, so no file is ever
-half new. The group `histories` holds some flights in full. The root's attribute `sweep` is the manifest;
-its attribute `summary`, written last of all, holds the statistics.
+half new. The group `histories` holds some flights in full. The root's attribute `sweep` is the
+manifest; its attribute `summary`, written last of all, holds the statistics.
 """
 
 import contextlib

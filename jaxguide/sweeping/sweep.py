@@ -92,11 +92,11 @@ def sweep(
     (case,), `miss` (by how much the endpoint constraints are missed, Euclidean norm, in units of
     `mission.miss` or their own), for every dispersed leaf `draw:path`, its deviation, and
     `applied:path`, its flown value, `final_time` where the law decides it; `history_case`,
-    `history_t`, `history_x`, `history_u` of the full flights; attributes `flown`, `rollouts_per_s` (warm), `compile_s`, `percentiles`
-    (with confidence bounds), `success_rate` with Wilson bounds, `failures`, the linear covariance
-    beside the sampled one, `importance` of each dispersed number (first-order Sobol indices with
-    the half width of their 95 % bounds, from the first 64 tiles) beside `linear_importance`, and
-    the `worst` cases.
+    `history_t`, `history_x`, `history_u` of the full flights; attributes `flown`, `rollouts_per_s`
+    (warm), `compile_s`, `percentiles` (with confidence bounds), `success_rate` with Wilson bounds,
+    `failures`, the linear covariance beside the sampled one, `importance` of each dispersed number
+    (first-order Sobol indices with the half width of their 95 % bounds, from the first 64 tiles)
+    beside `linear_importance`, and the `worst` cases.
 
     **Error:** percentiles to 2^-12 of their distance from the undispersed flight.
 

@@ -240,7 +240,7 @@ class Tiles:
         return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}, sums
 
     def _check_applied(self, rows: dict[str, np.ndarray], start: int) -> None:
-        """Each flown leaf must be that of the mission plus its draw, to the rounding of a flight."""
+        """Each flown leaf must be that of the mission plus its draw, up to rounding."""
         for path, leaf in self._leaves_drawn.items():
             drawn, applied = rows[f"draw:{path}"], rows[_applied(path)]
             # One rounding of the sum; one of the draw where XLA contracts its product into the sum.
