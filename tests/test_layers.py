@@ -111,7 +111,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "sweep",
     ),
     "tuning": (
-        "designs",
+        "variables",
         "counts",
         "measures",
         "meshes",

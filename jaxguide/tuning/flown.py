@@ -17,17 +17,17 @@ Measure = Callable[[Mission, Flight], Any]
 
 
 class Flown(eqx.Module):
-    """`flown(mission, keys)`: what `measure` says of each case's flight, a leading case axis added.
+    """A function of (mission, keys (cases,)): flies a dispersed case for each key and returns its
+    `measure`, with a leading case axis.
 
-    Case k is case k of `jg.sweep` with the same seed. Cases are flown `chunk` at a time, and flown
-    again when the gradient comes back: reverse mode keeps one chunk's samples, whatever the number
-    of cases.
+    Case k is case k of `jg.sweep` with the same seed. Cases are flown `chunk` at a time, and again
+    in the backward pass, so that reverse mode stores the samples of one chunk only.
 
     **Arguments:**
 
     - `dispersions`: path (or paths, as a tuple) -> distribution, as for `jg.sweep`.
-    - `measure(mission, flight)`: of one flight, and the mission as dispersed: a scalar, or any
-      pytree of arrays. Default `endpoint_miss`.
+    - `measure(mission, flight)`: of the dispersed mission and its flight: a scalar, or any pytree
+      of arrays. Default `endpoint_miss`.
     - `save`: "ends", or "samples" where the measure looks at histories.
     - `chunk`: cases flown at once.
     """

@@ -15,8 +15,8 @@ from jaxguide.problems.lunar_launch import LunarLaunch, mission
 from jaxguide.reproduce.lunar_launch.flights import TARGET, fly_cases, thesis_mission
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
-from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.loop import tune
+from jaxguide.tuning.variables import Ascending
 
 WEIGHTS = (1.0, 0.1, 0.1)  # of squared errors of y [ft], u and v [ft/s] at the end
 ALLOWANCE = 0.02  # s of extra flight that cost nothing
