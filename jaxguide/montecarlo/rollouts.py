@@ -134,7 +134,7 @@ def rerun(
     **Arguments:** `sampling`, and for "latin_hypercube" `cases`: as they were in the sweep.
 
     **Error:** a sweep's program may round differently: the final states agree to about 1e-12 of
-    their size (by experiment on the Earth-Mars sweeps).
+    their size (by experiment; the tests hold it).
 
     **Raises:** `ValueError` without the `cases` that a Latin hypercube needs.
     """

@@ -17,7 +17,7 @@ class _Pairs:
     def __init__(self):
         # Pairs, b lower, equal, failed in a only, failed in b only.
         self.counts = np.zeros(5)
-        self.origin: float | None = None
+        self.origin: Any = None
         self.sums, self.squares = np.zeros(3), np.zeros((3, 3))  # of a, b, b - a
 
     def add(self, left: Any, right: Any, quantity: str) -> None:
