@@ -141,8 +141,10 @@ def user(tmp_path, monkeypatch):
         file.parent.mkdir()
         file.write_text(source)
         spec = importlib.util.spec_from_file_location("user", file)
+        assert spec is not None
         module = importlib.util.module_from_spec(spec)
         monkeypatch.setitem(sys.modules, "user", module)
+        assert spec.loader is not None
         spec.loader.exec_module(module)
         return module
 
@@ -294,6 +296,13 @@ def test_another_program_is_refused(mission, tmp_path, monkeypatch):
             flown(mission, store=tmp_path / "a", resume=True)
     finally:
         tiles._program.cache_clear()
+
+
+def test_the_type_a_mission_has_already_is_no_change(mission, tmp_path):
+    flown(mission, store=tmp_path / "a", chunk=40)
+    flown(mission, store=tmp_path / "a", chunk=40, dtype="float64", resume=True)
+    with pytest.raises(ValueError, match=r"dtype \(float64, now float32\)"):
+        flown(mission, store=tmp_path / "a", chunk=40, dtype="float32", resume=True)
 
 
 # At no price ------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def in_full(order: Order, cases: np.ndarray) -> dict[str, tuple[tuple[str, ...],
     arguments = _arguments(order)
     padded = np.append(cases, np.full(-len(cases) % _LANES, cases[-1]))
     flights = [
-        jax.device_get(_fly_in_full(*arguments, jnp.asarray(group)))
+        jax.device_get(_fly_in_full(*(*arguments, jnp.asarray(group))))
         for group in padded.reshape(-1, _LANES)
     ]
     joined = lambda part: np.concatenate([np.asarray(part(f)) for f in flights])[: len(cases)]

@@ -16,6 +16,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.host import flags
@@ -145,7 +146,7 @@ def _texts(value: Any, above: tuple[int, ...]) -> Iterator[str]:
 
 
 def _of_array(value: Any) -> Iterator[str]:
-    if eqx.is_array(value) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+    if eqx.is_array(value) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         value = jax.random.key_data(value)
     array = np.asarray(value)
     yield f"{array.dtype}{array.shape}"

@@ -302,11 +302,16 @@ def again(
 
 
 def cast(mission: Mission, dtype: str) -> Mission:
-    """`mission` with every floating leaf in `dtype`: flights and sweeps also run in float32."""
+    """`mission` with every floating leaf in `dtype`: flights and sweeps also run in float32.
+
+    A leaf that has this type is left as it is, weakly typed or not, so that its programs are too.
+
+    **Raises:** `ValueError` for another type, or "float64" without 64 bits enabled.
+    """
     if dtype not in ("float32", "float64"):
         raise ValueError(f"dtype is {dtype!r}; choose 'float64' or 'float32'.")
     if dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
         raise ValueError("dtype 'float64' needs jax_enable_x64; enable it, or choose 'float32'.")
     floating = lambda a: eqx.is_array(a) and jnp.issubdtype(a.dtype, jnp.floating)
-    change = lambda a: a.astype(dtype) if floating(a) else a
+    change = lambda a: a.astype(dtype) if floating(a) and a.dtype != dtype else a
     return jax.tree_util.tree_map(change, mission)
