@@ -43,7 +43,7 @@ def in_full(order: Order, cases: np.ndarray) -> dict[str, tuple[tuple[str, ...],
     arguments = _arguments(order)
     padded = np.append(cases, np.full(-len(cases) % _LANES, cases[-1]))
     flights = [
-        jax.device_get(_fly_in_full(*(*arguments, jnp.asarray(group))))
+        jax.device_get(_fly_in_full(*arguments, jnp.asarray(group)))
         for group in padded.reshape(-1, _LANES)
     ]
     joined = lambda part: np.concatenate([np.asarray(part(f)) for f in flights])[: len(cases)]
@@ -61,9 +61,11 @@ def program_in_full(order: Order) -> str:
     return lowered(_fly_in_full, *_arguments(order), jnp.asarray(np.zeros(_LANES, np.int64)))
 
 
-def _arguments(order: Order) -> tuple:
-    shared = prepared_of(order), points_of(order), jax.random.key(order.seed)
-    return order.mission, order.dispersions, *shared
+def _arguments(
+    order: Order,
+) -> tuple[Mission, dict[Any, Distribution], Prepared | None, Points | None, Array]:
+    mission, dispersions, seeded = order.mission, order.dispersions, jax.random.key(order.seed)
+    return mission, dispersions, prepared_of(order), points_of(order), seeded
 
 
 @eqx.filter_jit
