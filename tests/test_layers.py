@@ -205,6 +205,19 @@ def test_every_import_points_down():
     assert violations(PACKAGE) == []
 
 
+def test_every_import_is_there():
+    """Imports inside functions run late: a file that was moved is missed at once."""
+    known = {".".join(("jaxguide", *parts)) for parts in modules(PACKAGE).values()}
+    rooms = {name.rpartition(".")[0] for name in known} | {"jaxguide"}
+    absent = [
+        f"{path.relative_to(PACKAGE)}: {name}"
+        for path in modules(PACKAGE)
+        for name in imported(path, PACKAGE)
+        if name not in known | rooms
+    ]
+    assert absent == []
+
+
 def test_no_circle():
     assert circle(PACKAGE) == []
 

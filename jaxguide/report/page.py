@@ -156,16 +156,16 @@ def _headline(attrs: dict[str, Any]) -> str:
 
 def _inputs(manifest: dict[str, Any], attrs: dict[str, Any]) -> str:
     about = attrs["about"]
-    flown = _number(attrs["flown"])
+    flights = _number(attrs["flown"])
     if attrs["flown"] < manifest["cases"]:
-        flown += f" of {manifest['cases']:,}; stopped by {_text(manifest['stop'])}"
+        flights += f" of {manifest['cases']:,}; stopped by {_text(manifest['stop'])}"
     plant = {k: v for k, v in about["plant"].items() if k not in ("class", "controls")}
     numbers = ", ".join(f"{k} = {_value(v)}" for k, v in plant.items())
     rows = [
         ("mission", _text(manifest.get("label") or "not of the library")),
         ("plant", f"{_text(about['plant']['class'])}<br><small>{_text(numbers)}</small>"),
         ("law", f"{_text(about['law'])}, sampled {_sampling(about['sample_interval'])}"),
-        ("flights", flown),
+        ("flights", flights),
         ("seed, sampling", f"{manifest['seed']}, {_text(attrs['sampling'].replace('_', ' '))}"),
         ("precision", _text(manifest["dtype"])),
         ("kept", _text(manifest["keep"])),

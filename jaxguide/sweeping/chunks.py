@@ -19,7 +19,7 @@ from jaxguide.sweeping.totals import Totals
 Chunk = tuple[int, dict, dict]  # number, rows and sums
 
 
-class Plan(NamedTuple):
+class SweepPlan(NamedTuple):
     """How a sweep is flown: `each` tiles a chunk, the variables `kept` of a case, the store that
     keeps them, the rule that may stop it, and the address of a Dask scheduler."""
 
@@ -50,7 +50,7 @@ class Flights(NamedTuple):
     seconds: float
 
 
-def fly_chunks(plan: Plan, missing: list[int], progress: Any) -> Flights:
+def fly_chunks(plan: SweepPlan, missing: list[int], progress: Any) -> Flights:
     """Flies the chunks `missing` and keeps them; adds up the sums of all chunks.
 
     A rule looks at the totals after every `LOOK` tiles, in the order of cases.
@@ -80,7 +80,7 @@ def fly_chunks(plan: Plan, missing: list[int], progress: Any) -> Flights:
     return Flights(totals.all(), ended, flown, time.perf_counter() - began)
 
 
-def _enough(plan: Plan, last: int, totals: Totals) -> bool:
+def _enough(plan: SweepPlan, last: int, totals: Totals) -> bool:
     """Whether the rule, if it looks after chunk `last`, stops the sweep there."""
     if plan.stop is None or (last + 1) * plan.each % LOOK:
         return False
@@ -93,7 +93,7 @@ def tally_of(tiles: Tiles, totals: dict[str, np.ndarray]) -> Tally:
     return Tally(*tiles.reference, totals["moments"], totals["histogram"])
 
 
-def _coming(plan: Plan, missing: list[int]) -> Generator[Chunk]:
+def _coming(plan: SweepPlan, missing: list[int]) -> Generator[Chunk]:
     """The chunks `missing`, flown here or by the workers of a cluster."""
     tiles, each = plan.tiles, plan.each
     if plan.scheduler is not None:
@@ -101,9 +101,9 @@ def _coming(plan: Plan, missing: list[int]) -> Generator[Chunk]:
         names, scheduler = tiles.names, plan.scheduler
         yield from over_workers(tiles.order, chunks, each, plan.kept, len(names), scheduler)
         return
-    flown = over_cores(tiles.fly, (i for k in missing for i in plan.tiles_of(k)))
+    parts = over_cores(tiles.fly, (i for k in missing for i in plan.tiles_of(k)))
     for k in missing:
-        rows, sums = tiles.chunk([next(flown) for _ in plan.tiles_of(k)], k * each, each)
+        rows, sums = tiles.chunk([next(parts) for _ in plan.tiles_of(k)], k * each, each)
         yield k, rows, sums
 
 

@@ -71,7 +71,7 @@ def fly_chunk(
     **Returns:** `k`, the rows `kept` and the sums, the histogram `packed`.
     """
     ready = get_worker().plugins[name].tiles  # pyright: ignore[reportAttributeAccessIssue]
-    flown = over_cores(ready.fly, tiles, len(ready.devices))
-    rows, sums = ready.chunk(list(flown), tiles.start, each)
+    parts = over_cores(ready.fly, tiles, len(ready.devices))
+    rows, sums = ready.chunk(list(parts), tiles.start, each)
     sums["histogram"] = packed(sums["histogram"])
     return k, {row: rows[row] for row in kept}, sums

@@ -16,7 +16,7 @@ from jaxguide.montecarlo.rollouts import dimensions, draw
 from jaxguide.montecarlo.sampling import SAMPLINGS
 from jaxguide.montecarlo.statistics import wilson_bounds
 from jaxguide.sweeping import importance, ranking
-from jaxguide.sweeping.chunks import Flights, Plan, fly_chunks, tally_of
+from jaxguide.sweeping.chunks import Flights, SweepPlan, fly_chunks, tally_of
 from jaxguide.sweeping.histories import cases_in_full, in_full, program_in_full
 from jaxguide.sweeping.identity import about, manifest
 from jaxguide.sweeping.keeping import AbstractStore, Memory
@@ -126,7 +126,7 @@ def sweep(
         asked = {"keep": keep, "label": label, "stop": repr(stop)}
         asked |= {"histories": histories, "failures": failures}
         kept_by = _opened(Path(store), tiles, asked, variables, each, resume)
-    plan = Plan(tiles, kept_by, each, tuple(variables), stop, scheduler)
+    plan = SweepPlan(tiles, kept_by, each, tuple(variables), stop, scheduler)
 
     missing = [k for k in range(plan.count) if not kept_by.has(k)]
     compile_s = _compiled(tiles) if missing and scheduler is None else 0.0
