@@ -1,6 +1,6 @@
-"""Is this installation fit for use? Versions, devices, precision, cache, and a known fault of JAX.
+"""Checks of an installation: versions, devices, precision, cache, and a known fault of JAX.
 
-Host-side, and imports nothing of jaxguide: it must run when the rest does not.
+Host only, and imports nothing of jaxguide: it must run when the rest does not.
 """
 
 import importlib.metadata
@@ -12,8 +12,8 @@ import numpy as np
 
 FAULTY_JAX = ("0.10.2",)  # jax issue 39103
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "optax", "numpy")
-# Thresholds were seen at 16,385 rows (float64) and 32,769 rows (float32); the fault comes and goes
-# with the row count (0 bad rows at 100,000 x 6), hence several.
+# By experiment on jax 0.10.2: the fault begins at 16,385 rows (float64) and 32,769 rows (float32),
+# but comes and goes with the row count (0 bad rows at 100,000 x 6), so several are checked.
 CANARY_ROWS = (16_384, 16_385, 20_000, 32_769, 50_000)
 CANARY_COLUMNS = (3, 6)
 
@@ -21,8 +21,8 @@ CANARY_COLUMNS = (3, 6)
 def canary() -> int:
     """Number of wrong rows in jitted mat-vecs followed by a reduction, vmapped over many rows.
 
-    Some JAX releases return wrong numbers here without a word. Checked in float32, and in float64
-    if it is enabled, against NumPy.
+    Some JAX releases return wrong numbers here without any error. Checked against NumPy in
+    float32, and in float64 if it is enabled.
 
     **Returns:** 0 on a sound JAX.
     """
@@ -46,65 +46,77 @@ def canary() -> int:
     return wrong
 
 
-def report() -> dict[str, dict[str, Any]]:
-    """Everything checked, by name: `{"value": ..., "ok": bool, "remedy": str}`.
+def check_installation() -> dict[str, dict[str, Any]]:
+    """Every check by name: `{"value": ..., "ok": bool, "remedy": str}`.
 
     `remedy` is empty where `ok` holds.
     """
-    import jax
+    return {**_versions(), **_numbers(), **_environment()}
 
-    checks: dict[str, dict[str, Any]] = {}
 
-    def check(name: str, value: Any, ok: bool, remedy: str) -> None:
-        checks[name] = {"value": value, "ok": bool(ok), "remedy": "" if ok else remedy}
+def _check(value: Any, ok: bool, remedy: str) -> dict[str, Any]:
+    return {"value": value, "ok": bool(ok), "remedy": "" if ok else remedy}
 
-    wanted = _requirements()
-    python = platform.python_version()
-    check("python", python, _meets(python, wanted["python"]), f"use Python {wanted['python']}")
+
+def _versions() -> dict[str, dict[str, Any]]:
+    """Python and the packages, against the ranges that jaxguide asks for."""
+    wanted, python = _requirements(), platform.python_version()
+    fits = _meets(python, wanted["python"])
+    checks = {"python": _check(python, fits, f"use Python {wanted['python']}")}
     for name in PACKAGES:
         try:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             version = None
-        needed = f"{name}{wanted.get(name, '')}"
-        ok = version is not None and _meets(version, wanted.get(name, ""))
-        check(name, version, ok, f"pip install '{needed}'")
-
-    check(
-        "faulty jax",
-        jax.__version__,
-        jax.__version__ not in FAULTY_JAX,
-        "this release gives wrong numbers on CPU (jax issue 39103): pip install 'jax!=0.10.2'",
-    )
-    wrong = canary()
-    check(
-        "canary",
-        f"{wrong} wrong rows",
-        wrong == 0,
-        "this JAX gives wrong numbers for batched mat-vecs: install another release of jax",
-    )
-    check(
-        "devices",
-        [f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()],
-        len(jax.devices()) > 0,
-        "no device found: see the installation notes of JAX for your accelerator",
-    )
-    check(
-        "x64",
-        _x64(),
-        _x64(),
-        "nominal solves need float64: jax.config.update('jax_enable_x64', True), "
-        "or set JAX_ENABLE_X64=1",
-    )
-    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    check(
-        "compilation cache",
-        cache,
-        cache is not None and _writable(cache),
-        "every process compiles anew: set JAX_COMPILATION_CACHE_DIR to a folder you may write",
-    )
-    check("cores", os.cpu_count(), True, "")
+        needed = wanted.get(name, "")
+        ok = version is not None and _meets(version, needed)
+        checks[name] = _check(version, ok, f"pip install '{name}{needed}'")
     return checks
+
+
+def _numbers() -> dict[str, dict[str, Any]]:
+    """Whether this JAX computes right numbers."""
+    import jax
+
+    wrong = canary()
+    return {
+        "faulty jax": _check(
+            jax.__version__,
+            jax.__version__ not in FAULTY_JAX,
+            "this release gives wrong numbers on CPU (jax issue 39103): pip install 'jax!=0.10.2'",
+        ),
+        "canary": _check(
+            f"{wrong} wrong rows",
+            wrong == 0,
+            "this JAX gives wrong numbers for batched mat-vecs: install another release of jax",
+        ),
+    }
+
+
+def _environment() -> dict[str, dict[str, Any]]:
+    """Devices, precision, the compilation cache, and the number of cores."""
+    import jax
+
+    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    return {
+        "devices": _check(
+            [f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()],
+            len(jax.devices()) > 0,
+            "no device found: see the installation notes of JAX for your accelerator",
+        ),
+        "x64": _check(
+            _x64(),
+            _x64(),
+            "nominal solves need float64: jax.config.update('jax_enable_x64', True), "
+            "or set JAX_ENABLE_X64=1",
+        ),
+        "compilation cache": _check(
+            cache,
+            cache is not None and _writable(cache),
+            "every process compiles anew: set JAX_COMPILATION_CACHE_DIR to a folder you may write",
+        ),
+        "cores": _check(os.cpu_count(), True, ""),
+    }
 
 
 def _x64() -> bool:

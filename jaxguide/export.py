@@ -1,7 +1,7 @@
-"""A stored sweep in formats of others: CSV, JSON, Parquet, netCDF. Host only.
+"""A stored sweep in other formats: CSV, JSON, Parquet, netCDF. Host only.
 
-Cases are read and written a block at a time, so that any number fits in memory. The file appears
-under its name when it is whole.
+Cases are read and written a block at a time, so that any number fits in memory. The file gets its
+name when it is complete.
 """
 
 import csv
@@ -17,7 +17,7 @@ import numpy as np
 from jaxguide.sweeping import store as stores
 from jaxguide.types import message
 
-_BLOCK = 65_536  # cases at once
+_BLOCK = 65_536  # cases read at once: some megabytes
 
 
 def export(store: Any, out: Any) -> Path:
@@ -30,8 +30,8 @@ def export(store: Any, out: Any) -> Path:
     - `.nc` (needs h5netcdf): the Dataset with its dimensions and flights in full; its attributes
       that are not numbers as JSON text.
 
-    **Raises:** `ValueError` where there is no sweep, or for another ending; `RuntimeError` without
-    the library that a format needs; `OSError` where nothing can be written.
+    **Raises:** `ValueError` if there is no sweep, or for another ending; `RuntimeError` without the
+    library that a format needs; `OSError` if nothing can be written.
     """
     store, out = Path(store), Path(out)
     writer = _WRITERS.get(out.suffix)
@@ -39,11 +39,11 @@ def export(store: Any, out: Any) -> Path:
         raise ValueError(
             f"export: {out.name!r} ends in {out.suffix!r}; choose one of {', '.join(_WRITERS)}."
         )
-    told = stores.described(store)
+    attributes = stores.attributes_of(store)
     out.parent.mkdir(parents=True, exist_ok=True)
     beside = out.with_name(f".{out.name}.partial{out.suffix}")
     try:
-        writer(store, told, beside)
+        writer(store, attributes, beside)
         os.replace(beside, out)
     finally:
         beside.unlink(missing_ok=True)
@@ -51,7 +51,7 @@ def export(store: Any, out: Any) -> Path:
 
 
 def columns(data: Any) -> dict[str, Callable[[slice], np.ndarray]]:
-    """Name -> what reads a block of it, for every number of a case."""
+    """Column -> function that reads a block of it, for every number of a case."""
     states = [str(s) for s in data["state"].values]
     found: dict[str, Callable[[slice], np.ndarray]] = {
         "case": lambda rows: data["case"].values[rows]
@@ -78,8 +78,8 @@ def _named(name: str, values: np.ndarray) -> Any:
     return [message(int(v)) for v in values] if name == "result" else values.tolist()
 
 
-def _csv(store: Path, told: dict[str, Any], out: Path) -> None:
-    data = stores.opened(store)
+def _csv(store: Path, attributes: dict[str, Any], out: Path) -> None:
+    data = stores.open_store(store)
     found = columns(data)
     with out.open("w", newline="", encoding="utf-8") as stream:
         lines = csv.writer(stream)
@@ -90,12 +90,12 @@ def _csv(store: Path, told: dict[str, Any], out: Path) -> None:
             lines.writerows(zip(*read, strict=True))
 
 
-def _json(store: Path, told: dict[str, Any], out: Path) -> None:
-    data = stores.opened(store)
+def _json(store: Path, attributes: dict[str, Any], out: Path) -> None:
+    data = stores.open_store(store)
     with out.open("w", encoding="utf-8") as stream:
         stream.write("{")
         for name in ("sweep", "about", "summary"):
-            stream.write(f"{json.dumps(name)}: {json.dumps(told.get(name))},\n")
+            stream.write(f"{json.dumps(name)}: {json.dumps(attributes.get(name))},\n")
         stream.write('"cases": {')
         for i, (name, column) in enumerate(columns(data).items()):
             stream.write(f"{',' if i else ''}\n{json.dumps(name)}: [")
@@ -119,11 +119,11 @@ def _optional(module: str, form: str) -> Any:
         ) from e
 
 
-def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
+def _parquet(store: Path, attributes: dict[str, Any], out: Path) -> None:
     pa, parquet = _optional("pyarrow", "Parquet"), _optional("pyarrow.parquet", "Parquet")
-    data = stores.opened(store)
+    data = stores.open_store(store)
     found = columns(data)
-    rest = {k: json.dumps(told.get(k)) for k in ("sweep", "about", "summary")}
+    rest = {k: json.dumps(attributes.get(k)) for k in ("sweep", "about", "summary")}
     writer = None
     try:
         for rows in _blocks(data):
@@ -141,9 +141,9 @@ def _parquet(store: Path, told: dict[str, Any], out: Path) -> None:
             writer.close()
 
 
-def _netcdf(store: Path, told: dict[str, Any], out: Path) -> None:
+def _netcdf(store: Path, attributes: dict[str, Any], out: Path) -> None:
     _optional("h5netcdf", "netCDF")
-    data = stores.opened(store)
+    data = stores.open_store(store)
     text = {k: json.dumps(stores.plain(v)) for k, v in data.attrs.items()}
     data = data.assign_attrs(text).assign_coords(
         state=[str(s) for s in data["state"].values],

@@ -31,7 +31,7 @@ def test_canary_sees_a_wrong_row(monkeypatch):
 def test_report_names_every_check_with_a_remedy(monkeypatch):
     monkeypatch.setattr(doctor, "canary", lambda: 7)
     monkeypatch.setattr(doctor, "FAULTY_JAX", (jax.__version__,))
-    checks = doctor.report()
+    checks = doctor.check_installation()
     assert {*doctor.PACKAGES, "python", "devices", "x64", "compilation cache"} <= set(checks)
     for name in ("canary", "faulty jax"):
         assert not checks[name]["ok"]
@@ -44,4 +44,4 @@ def test_refused_versions(monkeypatch, version):
     monkeypatch.setattr(doctor, "canary", lambda: 0)
     monkeypatch.setattr(doctor.importlib.metadata, "version", lambda name: version)
     monkeypatch.setattr(doctor, "_requirements", lambda: {"python": "", "jax": ">=0.10.0,!=0.10.2"})
-    assert not doctor.report()["jax"]["ok"]
+    assert not doctor.check_installation()["jax"]["ok"]

@@ -245,6 +245,17 @@ def test_help_imports_no_jax():
     assert any("reproduce" in line for line in out)
 
 
+def test_the_old_path_of_the_flags_imports_no_jax():
+    code = (
+        "import sys, jaxguide.montecarlo.flags as old; from jaxguide.host import flags; "
+        "from jaxguide.montecarlo.flags import set_for_flights; "
+        "from jaxguide.montecarlo import flags as again; "
+        "print(old is flags is again, set_for_flights is flags.set_for_flights, "
+        "'jax' in sys.modules)"
+    )
+    assert python(code).stdout.split() == ["True", "True", "False"]
+
+
 @pytest.mark.parametrize("given", [False, True])
 def test_configure(tmp_path, given):
     """float64 and a cache: the user's own if named, else in the user's cache folder."""

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxguide import problems, tuning
 from jaxguide.montecarlo.rollouts import case_key
 from jaxguide.problems.designs import moon_lander
-from jaxguide.tuning.designs import named, values
+from jaxguide.tuning.variables import named, values
 
 
 def directional(ready, design, cases, temperature=None, width=1e-3):

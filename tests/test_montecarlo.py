@@ -15,7 +15,7 @@ from conftest import DoubleIntegrator
 from scipy import stats
 
 import jaxguide as jg
-from jaxguide.montecarlo.rollouts import apply, case_key, draw
+from jaxguide.montecarlo.rollouts import case_key, draw, with_deviations
 from jaxguide.montecarlo.statistics import wilson_bounds
 from jaxguide.sweeping import tiles as tiles_module
 from jaxguide.sweeping.tally import BINS, Tally, count_in, tile_moments
@@ -58,7 +58,7 @@ def test_rollouts_are_the_single_flights(mission):
     for i, key in enumerate(keys):
         k_draw, _ = jax.random.split(key)
         draws = draw(mission, DISPERSIONS, k_draw)
-        alone = one(apply(mission, draws))
+        alone = one(with_deviations(mission, draws))
         # Lanes are contracted differently from single flights: rounding times gains of 600.
         np.testing.assert_allclose(flights.x[i], alone.x, rtol=0, atol=1e-12)
         np.testing.assert_allclose(flights.x[i, 0], draws["initial_state"], rtol=1e-15)
@@ -68,7 +68,7 @@ def test_rollouts_are_the_single_flights(mission):
 
 def test_draws_reach_their_leaves(mission):
     draws = {"initial_state": jnp.array([0.5, 0.25]), "plant.k": jnp.asarray(0.1)}
-    moved = apply(mission, draws)
+    moved = with_deviations(mission, draws)
     np.testing.assert_array_equal(moved.initial_state, [0.5, 0.25])
     assert float(moved.plant.k) == 1.1 and float(mission.plant.k) == 1.0
     assert float(moved.law.schedule.extremal.problem.k) == 1.0  # the law's model stays

@@ -207,12 +207,12 @@ def test_what_was_applied_is_kept(mission, whole):
 
 def test_a_draw_that_is_not_applied_is_told(mission, monkeypatch):
     """A fault planted in the application of draws: k moves by its draw and a millionth more."""
-    sound = tiles.apply
+    sound = tiles.with_deviations
 
     def faulty(mission, draws):
         return sound(mission, {k: v * (1 + 1e-6 * (k == "plant.k")) for k, v in draws.items()})
 
-    monkeypatch.setattr(tiles, "apply", faulty)
+    monkeypatch.setattr(tiles, "with_deviations", faulty)
     tiles._program.cache_clear()
     try:
         with pytest.raises(RuntimeError, match="case 0 was flown with plant.k = .* but .* drawn"):

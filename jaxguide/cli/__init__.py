@@ -54,9 +54,9 @@ def run(argv: list[str]) -> int:
             outcome = command(*bound.args, **bound.kwargs)
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
-    # The library's own complaints (UnknownName is a ValueError, Equinox's and XLA's errors are
-    # RuntimeErrors), unwritable folders, missing extras. Anything else is a bug: its traceback
-    # is wanted.
+    # The library's own errors (UnknownName is a ValueError, Equinox's and XLA's errors are
+    # RuntimeErrors), unwritable folders, missing extras. Anything else is a bug, whose traceback
+    # is needed.
     except (ValueError, RuntimeError, OSError, ImportError) as error:
         if common.debug:
             raise
@@ -76,7 +76,7 @@ def run(argv: list[str]) -> int:
 def configure() -> None:
     """float64, and a compilation cache that lasts, for this process.
 
-    Called before JAX and Equinox are imported: both read the environment as they are.
+    Called before JAX and Equinox are imported: both read the environment when imported.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # cache hits on CPU are noisy
     # Source lines in compiled programs serve debuggers and take a tenth of a short run.

@@ -1,4 +1,4 @@
-"""What every command shares: its options, its outcome, and how it solves, saves and tells."""
+"""Parts of every command: its options, its outcome, solving a named problem, saving figures."""
 
 import dataclasses
 from pathlib import Path
@@ -30,7 +30,8 @@ class Common:
 
 @dataclasses.dataclass
 class Outcome:
-    """What a command found: `data` for `--json`, `shown` for people."""
+    """Outcome of a command: `data` for `--json`, `shown` for people (lines and tables of Rich), and
+    whether the exit code is 0."""
 
     data: dict[str, Any]
     shown: list[Any]
@@ -38,7 +39,7 @@ class Outcome:
 
 
 def solved(name: str, watch: Any = None) -> tuple[Any, Any]:
-    """A problem of the library and its extremal."""
+    """A problem of the library and its extremal; `watch`: as for `jg.solve`."""
     from jaxguide import problems as library
 
     problem = library.get(name)
@@ -49,6 +50,7 @@ def solved(name: str, watch: Any = None) -> tuple[Any, Any]:
 
 
 def result_of(result: Any) -> dict[str, Any]:
+    """A RESULTS as data: whether it is a success, and its message."""
     from jaxguide.types import RESULTS, succeeded
 
     message = RESULTS[result]
@@ -56,16 +58,19 @@ def result_of(result: Any) -> dict[str, Any]:
 
 
 def folder(out: Path | None) -> Path | None:
+    """`out`, made if it is a folder that is not there."""
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     return out
 
 
-def save(figure: Any, out: Path, stem: str) -> str:
+def save_figure(figure: Any, out: Path, stem: str) -> str:
+    """Writes a figure as `stem`.png into the folder `out`; returns the path of the file."""
     from jaxguide import plotting
 
     return plotting.save(figure, out / f"{stem}.png")
 
 
 def written(figures: list[str]) -> list[Text]:
+    """A line that names the figures written; none without figures."""
     return [Text("written: " + ", ".join(figures))] if figures else []

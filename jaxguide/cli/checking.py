@@ -12,9 +12,9 @@ def doctor(*, common: Common = Common()) -> Outcome:
 
     Exits with 1 if a check fails.
     """
-    from jaxguide.doctor import report
+    from jaxguide.doctor import check_installation
 
-    checks = report()
+    checks = check_installation()
     ok = all(check["ok"] for check in checks.values())
     table = Table("", "", "", box=None, show_header=False)
     for name, check in checks.items():

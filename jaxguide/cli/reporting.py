@@ -1,4 +1,4 @@
-"""What is made of stored sweeps: `jaxguide report`, `export`, `compare`."""
+"""Stored sweeps read: `jaxguide report`, `export`, `compare`."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from jaxguide.cli.app import Common, Outcome, app
 
 @app.command
 def report(store: Path, *, out: Path | None = None, common: Common = Common()) -> Outcome:
-    """Write a stored sweep as one HTML file with its figures inside, to be read without network.
+    """Write a stored sweep as one HTML file with its figures inside, readable without a network.
 
     Parameters
     ----------
@@ -44,19 +44,19 @@ def export(store: Path, out: Path, *, common: Common = Common()) -> Outcome:
 
 @app.command
 def compare(a: Path, b: Path, *, quantity: str = "miss", common: Common = Common()) -> Outcome:
-    """Compare two stored sweeps with the same draws, case by case: b less a.
+    """Compare two stored sweeps with the same draws, case by case: b minus a.
 
     Parameters
     ----------
     a, b
         Zarr stores of sweeps with one seed, flown by different laws, say.
     quantity
-        What to compare: "miss", "final_time", or a state at the end.
+        The quantity compared: "miss", "final_time", or a state at the end.
     """
     from jaxguide.sweeping.compare import compare as paired
-    from jaxguide.sweeping.store import opened
+    from jaxguide.sweeping.store import open_store
 
-    data = paired(opened(a), opened(b), quantity)
+    data = paired(open_store(a), open_store(b), quantity)
     table = Table("", "", box=None, show_header=False)
     for key, value in data.items():
         text = f"{value:.6g}" if isinstance(value, float) else str(value)

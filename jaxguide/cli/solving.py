@@ -2,12 +2,12 @@
 
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rich.table import Table
 from rich.text import Text
 
-from jaxguide.cli.app import Common, Outcome, app, folder, result_of, save, solved, written
+from jaxguide.cli.app import Common, Outcome, app, folder, result_of, save_figure, solved, written
 from jaxguide.host.progress import RichProgress, waiting
 
 
@@ -16,16 +16,16 @@ def problems(*, common: Common = Common()) -> Outcome:
     """List the problems of the library."""
     from jaxguide import problems as library
 
-    described = {name: library.describe(name) for name in library.names()}
+    texts = {name: library.describe(name) for name in library.names()}
     table = Table("problem", "", box=None)
-    for name, text in described.items():
+    for name, text in texts.items():
         table.add_row(name, Text(text))
-    return Outcome({"problems": described}, [table])
+    return Outcome({"problems": texts}, [table])
 
 
 @app.command
 def reproduce(name: str, *, out: Path | None = None, common: Common = Common()) -> Outcome:
-    """Compute a published result and print it beside the printed one.
+    """Compute a published result and print it beside the published one.
 
     Exits with 1 if a row is out of its tolerance.
 
@@ -57,7 +57,7 @@ def solve(
     plot
         Write a figure of states, controls and costates.
     out
-        Folder for the figure, which it asks for; with --plot alone, the current one.
+        Folder for the figure, which is then drawn; with --plot alone, the current folder.
     """
     from jaxguide import problems as library
 
@@ -71,7 +71,7 @@ def solve(
     if out is not None:
         from jaxguide.plotting import plot_extremal
 
-        figures = [save(plot_extremal(extremal), out, f"{name}-extremal")]
+        figures = [save_figure(plot_extremal(extremal), out, f"{name}-extremal")]
     data = {
         "problem": name,
         "objective": extremal.objective,
@@ -139,7 +139,7 @@ def gains(
     if out is not None:
         from jaxguide.plotting import plot_gains
 
-        figures = [save(plot_gains(schedule), out, f"{name}-gains")]
+        figures = [save_figure(plot_gains(schedule), out, f"{name}-gains")]
     data = {
         "problem": name,
         "method": method,
@@ -151,6 +151,12 @@ def gains(
         "resolved": resolved,
         "figures": figures,
     }
+    table = _gain_table(problem, schedule, resolved)
+    return Outcome(data, [table, *written(figures)], all(resolved))
+
+
+def _gain_table(problem: Any, schedule: Any, resolved: list[bool]) -> Table:
+    """A row for each time: the gains by name, their error, and whether they are resolved."""
     pairs = [(i, j) for i in range(schedule.K.shape[1]) for j in range(schedule.K.shape[2])]
     heads = [f"d{problem.control_names[i]}/d{problem.state_names[j]}" for i, j in pairs]
     table = Table("t", *heads, "error", "", box=None)
@@ -158,7 +164,7 @@ def gains(
         numbers = [f"{float(schedule.K[k, i, j]):.9g}" for i, j in pairs]
         note = "" if resolved[k] else Text("not resolved", "bold red")
         table.add_row(f"{float(t):.6g}", *numbers, f"{float(schedule.error[k]):.1e}", note)
-    return Outcome(data, [table, *written(figures)], all(resolved))
+    return table
 
 
 @app.command
@@ -184,7 +190,7 @@ def fly(name: str, *, out: Path | None = None, common: Common = Common()) -> Out
     if out is not None:
         from jaxguide.plotting import plot_flight
 
-        figures = [save(plot_flight(flight, solved(name)[1]), out, f"{name}-flight")]
+        figures = [save_figure(plot_flight(flight, solved(name)[1]), out, f"{name}-flight")]
     data = {
         "problem": name,
         "state_names": problem.state_names,

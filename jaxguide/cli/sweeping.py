@@ -1,4 +1,4 @@
-"""`jaxguide sweep` and `sweep rerun`: many flights, and one of them again."""
+"""`jaxguide sweep`, many flights, and `sweep rerun`, one of them again."""
 
 import contextlib
 from pathlib import Path
@@ -8,7 +8,7 @@ from cyclopts import App
 from rich.table import Table
 from rich.text import Text
 
-from jaxguide.cli.app import Common, Outcome, app, result_of, save, solved, written
+from jaxguide.cli.app import Common, Outcome, app, result_of, save_figure, solved, written
 from jaxguide.host.progress import RichProgress, waiting
 
 sweeps = App(name="sweep")
@@ -49,24 +49,24 @@ def sweep(
     store
         Zarr store for the results.
     resume
-        Go on with what the store holds.
+        Continue the sweep that the store holds.
     scheduler
         Address of a Dask scheduler.
     dtype
         Precision of the flights; the nominal and its gains are always float64.
     dispersions
-        A TOML or YAML file of what to disperse, in place of the problem's own.
+        A TOML or YAML file of dispersions, in place of the problem's own.
     sampling
         How cases lie over their distributions: at random, in layers, or evenly (Sobol).
     stop
         Stop early when bounds are narrow: "success:0.001" (width of the success rate's bounds) or
         "miss:99:1e-6" (of the 99th percentile of the miss, or of a state).
     keep
-        "summary" keeps statistics and each case's result alone, for millions of cases.
+        "summary" keeps only statistics and the result of each case, for millions of cases.
     histories
-        So many cases, the first, are kept with their whole histories.
+        How many cases, the first, are kept with their whole histories.
     failures
-        So many of those that failed, too.
+        How many failed cases, the first, are kept with their whole histories.
     out
         Folder for the figure.
     """
@@ -76,17 +76,8 @@ def sweep(
         raise ValueError("--resume needs the --store to go on with.")
     from jaxguide import problems as library
 
-    rule = None
-    if stop is not None:
-        from jaxguide.sweeping.stopping import rule as rule_of
-
-        rule = rule_of(stop)
-    if dispersions is None:
-        spread = library.dispersions(name)
-    else:
-        from jaxguide.sweeping.written import dispersions_from
-
-        spread = dispersions_from(dispersions)
+    rule = _rule(stop)
+    spread = library.dispersions(name) if dispersions is None else _read(dispersions)
     with waiting(RichProgress(f"mission {name}")):
         mission = library.mission(name)
     import jaxguide as jg
@@ -100,14 +91,27 @@ def sweep(
     if out is not None and keep == "all":
         from jaxguide.plotting import plot_sweep
 
-        figures = [save(plot_sweep(dataset), out, f"{name}-sweep")]
+        figures = [save_figure(plot_sweep(dataset), out, f"{name}-sweep")]
     data = dict(dataset.attrs)
     data |= {"problem": name, "cases": cases, "seed": seed, "dtype": dtype, "figures": figures}
     return Outcome(data, [_shown(data), *written(figures)])
 
 
+def _rule(stop: str | None) -> Any:
+    from jaxguide.sweeping.stopping import rule
+
+    return None if stop is None else rule(stop)
+
+
+def _read(dispersions: Path) -> Any:
+    from jaxguide.sweeping.written import dispersions_from
+
+    return dispersions_from(dispersions)
+
+
 def _shown(data: dict[str, Any]) -> Table:
-    """Numbers by name; dictionaries a line each, lists of dictionaries (the worst cases) too."""
+    """A table of the numbers of a sweep by name; one line for each entry of a nested dictionary,
+    and one for the worst cases."""
     table = Table("", "", box=None, show_header=False)
     short = lambda v: f"{v:.6g}" if isinstance(v, float) else str(v)
     for key, value in data.items():
@@ -117,25 +121,26 @@ def _shown(data: dict[str, Any]) -> Table:
             for name, inner in value.items():
                 table.add_row(f"{key}: {name}", Text(str(inner)))
         elif key == "worst":
-            told = ", ".join(f"{w['case']} ({w['measure']:.4g})" for w in value[:5])
-            table.add_row("worst cases", Text(told))
+            worst = ", ".join(f"{w['case']} ({w['measure']:.4g})" for w in value[:5])
+            table.add_row("worst cases", Text(worst))
         else:
             table.add_row(key, Text(short(value)))
     return table
 
 
 def options_of_xla(command: Any, arguments: dict[str, Any]) -> None:
-    """Before JAX starts: what makes flights fast; for a case again, what its store was made with,
-    since nominal and gains would otherwise differ in their last digits."""
+    """Sets XLA's options before JAX starts: for a sweep, those that make flights fast; for a case
+    flown again, those of its store, since with others the last digits of nominal and gains differ.
+    """
     from jaxguide.host import flags
 
     if command is sweep:
         flags.set_for_flights()
     elif command is rerun:
-        from jaxguide.sweeping.store import described
+        from jaxguide.sweeping.store import attributes_of
 
-        with contextlib.suppress(ValueError):  # which the command itself will tell
-            flags.take(described(arguments["store"])["sweep"].get("xla", ""))
+        with contextlib.suppress(ValueError):  # the command itself raises it again
+            flags.take(attributes_of(arguments["store"])["sweep"].get("xla", ""))
 
 
 @sweeps.command
@@ -157,39 +162,46 @@ def rerun(store: Path, case: int, *, out: Path | None = None, common: Common = C
     from jaxguide import problems as library
     from jaxguide.sweeping.store import stored
 
-    told, of_case = stored(store, case)
-    name = told["label"]
+    manifest, of_case = stored(store, case)
+    name = manifest["label"]
     with waiting(RichProgress(f"mission {name}")):
         mission = library.mission(name)
-    import numpy as np
-
     import jaxguide as jg
     from jaxguide.sweeping.sweep import again, cast
 
-    mission = cast(mission, told["dtype"])
-    dispersions, note = again(told, mission, library.dispersions(name), store)
-    sampled = {"sampling": told["sampling"], "cases": told["cases"]}
-    flight = jg.rerun(mission, dispersions, told["seed"], case, **sampled)
-    states = library.get(name).state_names
+    mission = cast(mission, manifest["dtype"])
+    dispersions, note = again(manifest, mission, library.dispersions(name), store)
+    sampled = {"sampling": manifest["sampling"], "cases": manifest["cases"]}
+    flight = jg.rerun(mission, dispersions, manifest["seed"], case, **sampled)
     figures = []
     if out is not None:
         from jaxguide.plotting import plot_flight
 
         picture = plot_flight(flight, solved(name)[1])
-        figures = [save(picture, out, f"{name}-case-{case}")]
-    final = np.asarray(flight.final_state)
-    was, same = of_case.get("final_state"), None
-    if was is not None:
-        rounding = 1e-12 if told["dtype"] == "float64" else 1e-4
-        same = bool(np.all(np.abs(final - was) <= rounding * np.maximum(1.0, np.abs(was))))
+        figures = [save_figure(picture, out, f"{name}-case-{case}")]
+    was = of_case.get("final_state")
+    same = None if was is None else _same_end(flight, was, manifest["dtype"])
     data = {
-        "problem": name, "case": case, "seed": told["seed"], "t": flight.t, "x": flight.x,
-        "u": flight.u, "final_state": final, "stored": was, "same": same, "figures": figures,
-        "result": result_of(flight.result), "note": note,
+        "problem": name, "case": case, "seed": manifest["seed"], "t": flight.t, "x": flight.x,
+        "u": flight.u, "final_state": flight.final_state, "stored": was, "same": same,
+        "figures": figures, "result": result_of(flight.result), "note": note,
     }  # fmt: skip
     table = Table("", "flown again", "stored", box=None)
-    for i, state in enumerate(states):
+    for i, state in enumerate(library.get(name).state_names):
         old = "not kept" if was is None else f"{float(was[i]):.15g}"
-        table.add_row(state, f"{float(final[i]):.15g}", old)
+        table.add_row(state, f"{float(flight.final_state[i]):.15g}", old)
     notes = [Text(note)] if note else []
     return Outcome(data, [table, *notes, *written(figures)], same is not False)
+
+
+# How well a flight alone agrees with the same one in a tile, of its size or of 1: programs round
+# differently (by experiment).
+_ROUNDING = {"float64": 1e-12, "float32": 1e-4}
+
+
+def _same_end(flight: Any, was: Any, dtype: str) -> bool:
+    """Whether the flight ends at the stored state `was`, up to rounding."""
+    import numpy as np
+
+    off = np.abs(np.asarray(flight.final_state) - was)
+    return bool(np.all(off <= _ROUNDING[dtype] * np.maximum(1.0, np.abs(was))))

@@ -1,4 +1,4 @@
-"""Work spread over host threads: XLA runs each program on one core and lets go of the interpreter's
+"""Work spread over host threads: XLA runs each program on one core, and releases the interpreter's
 lock meanwhile. Host only."""
 
 import collections
@@ -12,7 +12,10 @@ from typing import Any
 def over_cores(
     work: Callable[[Any], Any], items: Iterable[Any], workers: int | None = None
 ) -> Iterator[Any]:
-    """`work` of each item, in order, a few ahead of what is asked for."""
+    """`work(item)` for each item, in order, by `workers` threads (default: one for each core).
+
+    They work ahead of the consumer by at most three items each.
+    """
     workers = workers or os.cpu_count() or 1
     pool = ThreadPoolExecutor(workers)
     try:

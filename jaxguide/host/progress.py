@@ -1,6 +1,6 @@
 """Progress of long host-side work: an object with `init`, `step`, `close`, as Diffrax's meters.
 
-Host-only: the pure functions never see it. The default everywhere is none.
+Host only: the pure functions never see it. The default everywhere is none.
 """
 
 import threading
@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 @runtime_checkable
 class Progress(Protocol):
-    """What a long computation calls. Diffrax's progress meters fit it too."""
+    """A progress meter, as long computations call it; Diffrax's meters fit it too."""
 
     def init(self) -> Any:
         """State of a new meter."""
@@ -28,7 +28,7 @@ class Progress(Protocol):
 
 
 class NoProgress:
-    """Shows nothing."""
+    """A `Progress` that shows nothing."""
 
     def init(self) -> None:
         return None
@@ -41,15 +41,16 @@ class NoProgress:
 
 
 class RichProgress:
-    """A bar on stderr with the time elapsed and left; it pulses until the first `step`.
+    """A `Progress` as a bar on stderr, with the time elapsed and left; it pulses until the first
+    `step`.
 
     Nothing is shown where stderr is neither a terminal nor a notebook's.
 
     **Arguments:**
 
-    - `label`: what is being done.
-    - `delay`: seconds before it appears, so that quick work shows nothing.
-    - `total`, `unit`: of what there is to do, for a rate such as "490,000 flights/s".
+    - `label`: the name of the work.
+    - `delay`: seconds before the bar appears, so that quick work shows nothing.
+    - `total`, `unit`: the amount of work, for a rate such as "490,000 flights/s".
     """
 
     def __init__(self, label: str, delay: float = 2.0, total: int | None = None, unit: str = ""):
@@ -95,7 +96,7 @@ class RichProgress:
 
 @contextmanager
 def waiting(meter: Progress | None) -> Iterator[None]:
-    """Shows `meter` while the block runs, for work that cannot say how far it is."""
+    """Shows `meter` while the block runs, for work whose progress is unknown."""
     meter = NoProgress() if meter is None else meter
     state = meter.init()
     try:
@@ -105,7 +106,7 @@ def waiting(meter: Progress | None) -> Iterator[None]:
 
 
 def metered(items: Iterable[Any], count: int, meter: Progress | None) -> Iterator[Any]:
-    """`items`, `meter` shown how many of `count` have come."""
+    """Iterates over `items`, of which there are `count`, and steps `meter` after each."""
     meter = NoProgress() if meter is None else meter
     state = meter.init()
     try:

@@ -1,4 +1,4 @@
-"""Linear covariance of a closed loop: what the dispersions do to first order."""
+"""Linear covariance of a closed loop: the effect of the dispersions to first order."""
 
 from typing import Any
 
@@ -11,19 +11,23 @@ from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.miss import end_errors
-from jaxguide.montecarlo.rollouts import apply, draw, leaf_at, ordered, spread
+from jaxguide.montecarlo.rollouts import draw, leaf_at, sorted_by_path, spread, with_deviations
 
 
 def linear_covariance(
     mission: Mission, dispersions: dict[Any, Distribution], prepared: Prepared | None = None
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Final state of the undispersed flight and the covariance of the final state about it.
+    r"""Final state of the undispersed flight and the covariance of the final state about it.
 
-    The final state's Jacobian with respect to every dispersed quantity, through the same gains,
-    holds and integrator as the flights, sandwiches their covariance. Sensor noise is not included.
-    `prepared`: `shared(mission, dispersions)` if at hand.
+    $P = J \Sigma J^T$: $J$ is the Jacobian of the final state by every dispersed number, through
+    the same gains, holds and integrator as the flights; $\Sigma$ the covariance of these numbers.
+    Sensor noise is not included.
 
-    **Error:** first order in the dispersions; a sweep beside it shows what is left.
+    **Arguments:** `prepared`: `shared(mission, dispersions)` if at hand.
+
+    **Returns:** the final state (n,) and its covariance (n, n), in units of the plant.
+
+    **Error:** first order in the dispersions; the sampled covariance of a sweep shows the rest.
     """
     ends, parts = linear_parts(mission, dispersions, prepared)
     n = mission.plant.n
@@ -34,22 +38,25 @@ def linear_covariance(
 def linear_parts(
     mission: Mission, dispersions: dict[Any, Distribution], prepared: Prepared | None = None
 ) -> tuple[Float[Array, " k"], Float[Array, "part k k"]]:
-    """The undispersed end, the final state and then its `end_errors`, and what each part of the
-    dispersions adds to its covariance. The parts are those of `part_names`."""
+    """The end of the undispersed flight and the covariance that each part of the dispersions adds.
+
+    **Returns:** the end (k,): the final state, then its `end_errors`; and for each part, in the
+    order of `part_names`, its share (k, k) of the covariance of the end.
+    """
     shapes = jax.eval_shape(lambda: draw(mission, dispersions, jax.random.key(0)))
     zeros = {path: jnp.zeros(s.shape, s.dtype) for path, s in shapes.items()}
 
     def end(draws: dict[str, Array]) -> tuple[Array, Array]:
-        flown = apply(mission, draws)
-        flight = simulate(flown, jax.random.key(0), "ends", prepared)
-        errors = end_errors(flown, flight.final_state, flight.final_time)
+        deviated = with_deviations(mission, draws)
+        flight = simulate(deviated, jax.random.key(0), "ends", prepared)
+        errors = end_errors(deviated, flight.final_state, flight.final_time)
         both = jnp.concatenate([flight.final_state, errors])
         return both, both
 
     jacobians, ends = jax.jacfwd(end, has_aux=True)(zeros)
     parts = [jnp.zeros((0, ends.size, ends.size), ends.dtype)]
     for (paths, distribution), (_, covariance) in zip(
-        ordered(dispersions), spread(mission, dispersions), strict=True
+        sorted_by_path(dispersions), spread(mission, dispersions), strict=True
     ):
         flat = jnp.concatenate([jacobians[p].reshape(ends.size, -1) for p in paths], axis=1)
         covariance = covariance.astype(ends.dtype)
@@ -62,9 +69,10 @@ def linear_parts(
 
 
 def part_names(mission: Mission, dispersions: dict[Any, Distribution]) -> tuple[str, ...]:
-    """A name for each part: an entry of a leaf, or a whole set of entries that are correlated."""
+    """A name for each part of the dispersions: one entry of a leaf, or, where the entries are
+    correlated, all leaves of the distribution."""
     names: list[str] = []
-    for paths, distribution in ordered(dispersions):
+    for paths, distribution in sorted_by_path(dispersions):
         if distribution.independent:
             names += [name for path in paths for name in entry_names(mission, path)]
         else:
@@ -73,7 +81,7 @@ def part_names(mission: Mission, dispersions: dict[Any, Distribution]) -> tuple[
 
 
 def entry_names(mission: Mission, path: str) -> list[str]:
-    """A name for each entry of the leaf at `path`."""
+    """A name for each entry of the leaf at `path`: "initial_state[v]", or the path of a scalar."""
     leaf = leaf_at(mission, path)
     if leaf.ndim == 0:
         return [path]

@@ -12,37 +12,45 @@ from jaxtyping import Array
 
 from jaxguide.types import is_traced
 
+# Of the largest entry: eigenvalues of a singular covariance come out negative by rounding, n eps.
+_SINGULAR = 1e-12
+
 
 class Distribution(eqx.Module):
-    """Abstract: draws deviations of one leaf, from a key or from numbers on (0, 1)."""
+    """Abstract: the deviation that is added to one leaf of a Mission, in the units of the leaf.
 
-    independent: ClassVar[bool] = True  # whether the entries of a draw are
+    A subclass gives `sample` and `covariance`; with `quantile` it can also be drawn evenly
+    (`sampling="sobol"`, `"latin_hypercube"`).
+    """
+
+    independent: ClassVar[bool] = True  # whether the entries of a draw are independent
 
     @abc.abstractmethod
     def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
-        """One draw of the given shape."""
+        """One draw of the given shape and type, from a PRNG key."""
 
     @abc.abstractmethod
     def covariance(self, size: int, dtype: Any) -> Array:
-        """Covariance (size, size) of the flattened draw."""
+        """Covariance (size, size) of the flattened draw, in the leaf's units squared."""
 
     def quantile(self, u: Array) -> Array:
-        """The draw that `u`, of the leaf's shape and type on (0, 1), stands for: as random as a
-        sample if `u` is uniform.
+        """The draw whose distribution function is `u` (for correlated entries: of the independent
+        normal numbers behind them). If `u`, of the leaf's shape and type, is uniform on (0, 1), the
+        draw is distributed as a `sample` is.
 
-        **Raises:** `ValueError` where a distribution of the user's own has none.
+        **Raises:** `ValueError` for a subclass that does not define it.
         """
         raise ValueError(
-            f"{type(self).__name__} has no quantile, which evenly spread cases are drawn by; give "
-            'it one, or choose sampling="random".'
+            f"{type(self).__name__} has no quantile, which evenly spread cases need; define one, "
+            'or choose sampling="random".'
         )
 
     def deviation(self, key: Array, leaf: Array, u: Array | None = None) -> Array:
-        """One draw for `leaf`, by `u` if given: what is added to it."""
+        """The draw that is added to `leaf`: `quantile(u)` if `u` is given, else a `sample`."""
         return self.sample(key, leaf.shape, leaf.dtype) if u is None else self.quantile(u)
 
     def spread(self, leaf: Array) -> Array:
-        """Covariance of the flattened `deviation`."""
+        """Covariance (size, size) of the flattened `deviation` of `leaf`."""
         return self.covariance(leaf.size, leaf.dtype)
 
 
@@ -92,7 +100,11 @@ class Uniform(Distribution):
 
 
 class TruncatedNormal(Distribution):
-    """Normal deviations of `std` about `mean`, cut off below `lo` and above `hi`."""
+    """Independent normal deviations of `std` about `mean`, truncated to [`lo`, `hi`].
+
+    **Source:** of the variance: Johnson, Kotz & Balakrishnan, Continuous Univariate Distributions 1
+    (1994), chapter 13.
+    """
 
     std: Any
     lo: Any
@@ -116,7 +128,7 @@ class TruncatedNormal(Distribution):
 
     def quantile(self, u: Array) -> Array:
         std, mean, a, b = self._standard(u.shape, u.dtype)
-        # In the lower tail, where probabilities have their full precision.
+        # Computed in the lower tail, where probabilities near 0 keep their relative precision.
         flip = a > 0
         low, high = jnp.where(flip, -b, a), jnp.where(flip, -a, b)
         p, q = jax.scipy.stats.norm.cdf(low), jax.scipy.stats.norm.cdf(high)
@@ -133,8 +145,8 @@ class TruncatedNormal(Distribution):
 
 
 class LogNormal(Distribution):
-    r"""Deviations $e^{\sigma z} - 1$, z standard normal: within `Relative`, a factor $e^{\sigma z}$
-    on the leaf."""
+    r"""Independent deviations $e^{\sigma z} - 1$, z standard normal; within `Relative`, the leaf is
+    multiplied by $e^{\sigma z}$."""
 
     sigma: Any
 
@@ -155,7 +167,8 @@ class LogNormal(Distribution):
 
 
 class Relative(Distribution):
-    """What `distribution` draws, times the leaf: `Relative(Normal(0.01))` is one per cent."""
+    """The draws of `distribution` times the leaf: `Relative(Normal(0.01))` has a standard deviation
+    of one per cent of the leaf."""
 
     distribution: Distribution
 
@@ -193,7 +206,7 @@ class MultivariateNormal(Distribution):
         cov = np.asarray(self.cov, float)
         if cov.ndim != 2 or cov.shape[0] != cov.shape[1] or not np.allclose(cov, cov.T):
             raise ValueError(f"MultivariateNormal: cov must be square and symmetric, got\n{cov}.")
-        if np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max():
+        if np.linalg.eigvalsh(cov)[0] < -_SINGULAR * np.abs(cov).max():
             raise ValueError(f"MultivariateNormal: cov has a negative eigenvalue:\n{cov}.")
 
     def sample(self, key: Array, shape: tuple[int, ...], dtype: Any) -> Array:

@@ -16,9 +16,12 @@ from jaxguide.montecarlo.sampling import points
 def draw(
     mission: Mission, dispersions: dict[Any, Distribution], key: Array, u: Array | None = None
 ) -> dict[str, Array]:
-    """One case's deviations, by path. Each path has its own stream, so adding one moves no other.
+    """The deviations of one case, by path.
 
-    `u` (dimensions,): the case's point on the unit cube, by which it is drawn instead of by `key`.
+    Each path has its own random stream, so adding a dispersion changes no other draw.
+
+    **Arguments:** `key`: the PRNG key of the case; `u` (dimensions,): the point of the case on the
+    unit cube; if given, the draws are the quantiles at `u` instead of random numbers from `key`.
 
     A tuple of paths is drawn as one vector, their leaves one after another, so that they may be
     correlated (`jg.MultivariateNormal`).
@@ -27,7 +30,7 @@ def draw(
     """
     draws: dict[str, Array] = {}
     used = 0
-    for paths, distribution in ordered(dispersions):
+    for paths, distribution in sorted_by_path(dispersions):
         leaves = [leaf_at(mission, path) for path in paths]
         stream = jax.random.fold_in(key, _hash(" ".join(paths)))
         whole = leaves[0]
@@ -47,14 +50,15 @@ def draw(
 
 
 def dimensions(mission: Mission, dispersions: dict[Any, Distribution]) -> int:
-    """Numbers that are drawn for a case."""
-    return sum(leaf_at(mission, path).size for paths, _ in ordered(dispersions) for path in paths)
+    """How many numbers are drawn for a case."""
+    paths = (path for group, _ in sorted_by_path(dispersions) for path in group)
+    return sum(leaf_at(mission, path).size for path in paths)
 
 
 def spread(mission: Mission, dispersions: dict[Any, Distribution]) -> list[tuple]:
-    """(paths, covariance of their flattened deviations) of each dispersion."""
+    """(paths, covariance matrix of their flattened deviations) of each dispersion."""
     out = []
-    for paths, distribution in ordered(dispersions):
+    for paths, distribution in sorted_by_path(dispersions):
         leaves = [leaf_at(mission, path) for path in paths]
         whole = leaves[0]
         if len(paths) > 1:
@@ -63,13 +67,15 @@ def spread(mission: Mission, dispersions: dict[Any, Distribution]) -> list[tuple
     return out
 
 
-def ordered(dispersions: dict[Any, Distribution]) -> list[tuple[tuple[str, ...], Distribution]]:
-    """By their paths, each a tuple."""
+def sorted_by_path(
+    dispersions: dict[Any, Distribution],
+) -> list[tuple[tuple[str, ...], Distribution]]:
+    """(paths, distribution) of each dispersion, sorted by path; a single path is a tuple of one."""
     named = {(k,) if isinstance(k, str) else tuple(k): v for k, v in dispersions.items()}
     return sorted(named.items(), key=lambda item: item[0])
 
 
-def apply(mission: Mission, draws: dict[str, Array]) -> Mission:
+def with_deviations(mission: Mission, draws: dict[str, Array]) -> Mission:
     """`mission` with each drawn deviation added to its leaf."""
     for path, deviation in draws.items():
         mission = with_leaf(mission, path, lambda leaf, d=deviation: leaf + d)
@@ -100,14 +106,17 @@ def rollouts(
     def fly(key: Array, case: Array) -> Flight:
         k_draw, k_noise = jax.random.split(key)
         u = None if spread_by is None else spread_by(case, mission.initial_state.dtype)
-        flown = apply(mission, draw(mission, dispersions, k_draw, u))
-        return simulate(flown, k_noise, save, prepared)
+        deviated = with_deviations(mission, draw(mission, dispersions, k_draw, u))
+        return simulate(deviated, k_noise, save, prepared)
 
     return jax.vmap(fly)(keys, jnp.arange(keys.shape[0]))
 
 
 def case_key(seed: Any, case: Any) -> Array:
-    """The PRNG key of case `case` of a sweep: (seed, case) and nothing else."""
+    """The PRNG key of case `case` of a sweep: a function of (seed, case) alone.
+
+    **Arguments:** `seed`: an integer, or `jax.random.key` of it.
+    """
     key = seed if isinstance(seed, jax.Array) else jax.random.key(seed)
     return jax.random.fold_in(key, case)
 
@@ -120,11 +129,12 @@ def rerun(
     sampling: str = "random",
     cases: int | None = None,
 ) -> Flight:
-    """Flies case `case` of a sweep with this `seed` again, with its history.
+    """Flies case `case` of a sweep with this `seed` again, and returns its whole history.
 
-    `sampling`, and for "latin_hypercube" `cases`: those of the sweep.
+    **Arguments:** `sampling`, and for "latin_hypercube" `cases`: as they were in the sweep.
 
-    **Error:** a sweep's program may round differently: its final state to 1e-12 or so, relative.
+    **Error:** a sweep's program may round differently: the final states agree to about 1e-12 of
+    their size (by experiment; the tests hold it).
 
     **Raises:** `ValueError` without the `cases` that a Latin hypercube needs.
     """
@@ -134,19 +144,24 @@ def rerun(
     spread_by = points(sampling, case_key(seed, 0), size, case + 1 if cases is None else cases)
     u = None if spread_by is None else spread_by(case, mission.initial_state.dtype)
     k_draw, k_noise = jax.random.split(case_key(seed, case))
-    flown = apply(mission, draw(mission, dispersions, k_draw, u))
-    return simulate(flown, k_noise, "samples", shared(mission, dispersions))
+    deviated = with_deviations(mission, draw(mission, dispersions, k_draw, u))
+    return simulate(deviated, k_noise, "samples", shared(mission, dispersions))
 
 
 def shared(mission: Mission, dispersions: dict[Any, Distribution]) -> Prepared | None:
-    """What all cases have in common, unless the law or its times are themselves dispersed."""
+    """The sample times and prepared law that all cases share; None if the law or its times are
+    themselves dispersed, so that each case prepares its own."""
     own = ("law", "sample_interval", "initial_time", "final_time")
-    if any(path.split(".")[0] in own for paths, _ in ordered(dispersions) for path in paths):
+    if any(path.split(".")[0] in own for paths, _ in sorted_by_path(dispersions) for path in paths):
         return None
     return prepare(mission)
 
 
 def leaf_at(mission: Mission, path: str) -> Array:
+    """The array at a dotted `path` of the mission, such as "plant.thrust".
+
+    **Raises:** `ValueError` for a path that is not one array of the mission.
+    """
     found: list[Array] = []
 
     def keep(leaf: Any) -> Any:
@@ -158,7 +173,11 @@ def leaf_at(mission: Mission, path: str) -> Array:
 
 
 def _hash(path: str) -> int:
-    """A fixed 31-bit hash of a path (Python's own is salted)."""
+    """A 31-bit hash of a path, the same in every process (Python's own is salted).
+
+    A polynomial in 131 modulo the Mersenne prime 2^31 - 1. Any fixed hash would serve, but another
+    one would change all draws.
+    """
     value = 0
     for byte in path.encode():
         value = (value * 131 + byte) % (2**31 - 1)

@@ -1,7 +1,7 @@
 """Where on the unit cube the cases of a sweep lie: at random, stratified, or evenly spread.
 
 A point is a pure function of its case's number and of a key, so that a case can be flown alone, in
-any order and anywhere; nothing of the size of the sweep is stored.
+any order and in any process; no table with a row for each case is stored.
 """
 
 import abc
@@ -14,9 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 SAMPLINGS = ("random", "latin_hypercube", "sobol")
-_BITS = 32
-_ROUNDS = 6  # of a permutation's mixing (by experiment: from 4 on its cycles look random)
-_TAG = 0x51A7  # the stream of the points' own key
+_BITS = 32  # of a Sobol number and of a uint32 layer
+# Rounds that mix the layers of a Latin hypercube. By experiment: from 4 rounds on, the cycles of
+# the permutation look random.
+_ROUNDS = 6
+_TAG = 0x51A7  # names the random stream of the points among those of case 0; any number would do
 
 
 class Points(eqx.Module):
@@ -28,7 +30,7 @@ class Points(eqx.Module):
 
 
 class Sobol(Points):
-    """Sobol's sequence in the order of `scipy.stats.qmc.Sobol`, scrambled.
+    """Sobol's sequence, scrambled, in the order of `scipy.stats.qmc.Sobol`.
 
     The scrambling is a random lower-triangular matrix over GF(2) and a digital shift for each
     dimension: every point is uniform on the cube, and the first 2^m keep their even spread.
@@ -49,9 +51,10 @@ class Sobol(Points):
 
 
 class LatinHypercube(Points):
-    """One point in each of `cases` layers of every dimension, anywhere in its layer.
+    """In every dimension, one point in each of `cases` layers, at random within its layer.
 
-    The layers are permuted by a keyed bijection of [0, 2^b), walked until it falls below `cases`.
+    The layers are permuted by a keyed bijection of [0, 2^b), 2^b >= `cases`, applied again until
+    the number is below `cases`.
 
     **Source:** McKay, Beckman & Conover, Technometrics 21 (1979); the walk by Kensler, Pixar
     technical memo 13-01 (2013).
@@ -69,7 +72,7 @@ class LatinHypercube(Points):
         return jnp.clip(u, eps / 4, 1 - eps / 2)
 
     def layer(self, case: Any) -> UInt32[Array, " d"]:
-        """The case's layer in each dimension."""
+        """The layer of `case` in each dimension, an integer in [0, cases)."""
         x = jnp.broadcast_to(jnp.asarray(case).astype(jnp.uint32), self.mixers.shape[-1:])
         beyond = lambda x: x >= jnp.uint32(self.cases)
         walk = lambda x: jnp.where(beyond(x), self._mixed(x), x)
@@ -87,7 +90,7 @@ class LatinHypercube(Points):
 
 
 def points(sampling: str, key: Array, dimensions: int, cases: int) -> Points | None:
-    """The points of `cases` cases, randomised by the key of the first; None for "random".
+    """The points of `cases` cases, randomised by `key`, that of case 0; None for "random".
 
     **Raises:** `ValueError` for another name, or more cases than 2^32.
     """
@@ -114,10 +117,13 @@ def points(sampling: str, key: Array, dimensions: int, cases: int) -> Points | N
 
 
 def directions(dimensions: int) -> np.ndarray:
-    """Joe & Kuo's direction numbers (32, d), as SciPy has them."""
+    """Direction numbers (32, d) of Sobol's sequence, as SciPy has them.
+
+    **Source:** Joe & Kuo, SIAM J. Sci. Comput. 30 (2008).
+    """
     from scipy.stats import qmc
 
-    # SciPy shows them under no public name; a test compares the points they make.
+    # SciPy has no public name for them; a test compares the points made from them with SciPy's.
     table = qmc.Sobol(max(dimensions, 1), scramble=False, bits=_BITS)._sv
     return np.ascontiguousarray(table[:dimensions].T.astype(np.uint32))
 

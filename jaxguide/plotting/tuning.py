@@ -68,6 +68,6 @@ def _loss(ax: Axes, history: Mapping[str, Any], best: int) -> None:
 
 
 def _named_leaves(design: Any) -> dict[str, Any]:
-    from jaxguide.tuning.designs import named
+    from jaxguide.tuning.variables import named
 
     return named(design)

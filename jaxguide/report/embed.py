@@ -1,4 +1,4 @@
-"""Figures as SVG inside a page, in the page's own ink, so that they suit light and dark."""
+"""Figures as SVG inside a page, in the colours of the page, so that they suit light and dark."""
 
 import io
 import re
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxguide.plotting import COLOURS, STYLE
 
-# Stand-ins that the page's colours are put in place of.
+# Stand-ins, which are replaced by the colours of the page; no figure uses them otherwise.
 INK, FAINT, PAPER = "#010203", "#0a0b0c", "#0d0e0f"
 _COLOURS = {
     INK: "currentColor",
@@ -36,7 +36,10 @@ PAGE_STYLE: dict[Any, Any] = STYLE | {
 
 
 def drawn(draw: Callable[..., Figure | None], *args: Any, title: str) -> str:
-    """What `draw` draws, as inline SVG with `title` for readers who cannot see it; "" for None."""
+    """The figure that `draw(*args)` makes, as inline SVG; "" if it makes None.
+
+    **Arguments:** `title`: for readers who cannot see the figure; also makes the SVG's ids unique.
+    """
     settings: dict[Any, Any] = PAGE_STYLE | {"svg.hashsalt": title}  # ids of one page must differ
     with mpl.rc_context(settings):
         figure = draw(*args)

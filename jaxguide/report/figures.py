@@ -1,4 +1,4 @@
-"""The figures of a sweep's report: each a Figure, or None where there is nothing to draw."""
+"""The figures of a sweep's report: each a Figure, or None if there is nothing to draw."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from jaxguide.sweeping.tally import edges_of_bins
 SHOWN = 4000  # cases in a scatter; more only blacken it
 _ABREAST = 3  # panels of a figure
 _BLUE, _RED = COLOURS[1], COLOURS[2]
-_BANDS = ((1, 99, 0.18), (5, 95, 0.28), (25, 75, 0.4))
+_BANDS = ((1, 99, 0.18), (5, 95, 0.28), (25, 75, 0.4))  # percentiles and opacity
 
 
 def shown_cases(data: Any) -> dict[str, np.ndarray]:
@@ -38,7 +38,10 @@ def _panels(count: int, height: float, more: float, **options: Any) -> tuple[Fig
 
 
 def histograms(attrs: dict[str, Any], counts: np.ndarray) -> Figure | None:
-    """How every quantity is spread about the undispersed flight, over all successful cases."""
+    """Histogram of every quantity about the undispersed flight, over all successful cases.
+
+    **Arguments:** `attrs`: of the Dataset; `counts` (k, BINS): by `total_histograms`.
+    """
     names = attrs["quantities"]
     figure, axes = _panels(len(names), 1.9, 0.3)
     edges = edges_of_bins()
@@ -129,7 +132,7 @@ def _ellipses(axis: Any, mean: np.ndarray, sampled: np.ndarray, linear: np.ndarr
 
 
 def draws_against_miss(data: Any, cases: dict[str, np.ndarray], names: list[str]) -> Figure | None:
-    """The miss over every drawn number, with the mean and the 95th percentile along it."""
+    """The miss against every drawn number, with its running mean and 95th percentile."""
     if not cases or "miss" not in cases or not len(cases["miss"]):
         return None
     if not names:
@@ -155,10 +158,11 @@ def draws_against_miss(data: Any, cases: dict[str, np.ndarray], names: list[str]
     return figure
 
 
-def sensitivities(attrs: dict[str, Any]) -> Figure | None:
-    """Shares of variance that each drawn number explains by itself: sampled bars, linear marks."""
+def variance_shares(attrs: dict[str, Any]) -> Figure | None:
+    """Share of each outcome's variance that each drawn number explains by itself: bars from the
+    flights, marks from the linear covariance."""
     sampled, linear = attrs["importance"], attrs["linear_importance"]
-    outcomes = [o for o in sampled if any(_number(v[0]) for v in sampled[o].values())]
+    outcomes = [o for o in sampled if any(_finite(v[0]) for v in sampled[o].values())]
     if not outcomes:
         return None
     entries = list(sampled[outcomes[0]])
@@ -167,14 +171,14 @@ def sensitivities(attrs: dict[str, Any]) -> Figure | None:
     figure, axes = _panels(len(outcomes), 0.22 * len(ticks) + 0.75, 0.35, sharey=True)
     at = np.arange(len(ticks))
     for outcome, axis in zip(outcomes, axes, strict=False):
-        told = [sampled[outcome].get(name, (None, None)) for name in ticks]
-        share = np.array([100 * v if _number(v) else np.nan for v, _ in told])
-        half = np.array([100 * h if _number(h) else 0.0 for _, h in told])
+        indices = [sampled[outcome].get(name, (None, None)) for name in ticks]
+        share = np.array([100 * v if _finite(v) else np.nan for v, _ in indices])
+        half = np.array([100 * h if _finite(h) else 0.0 for _, h in indices])
         axis.barh(at, share, 0.62, color=_BLUE, alpha=0.45, label="sampled")
         axis.errorbar(share, at, xerr=half, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
         if outcome in linear:
             value = [linear[outcome].get(name) for name in ticks]
-            value = [100 * v if _number(v) else np.nan for v in value]
+            value = [100 * v if _finite(v) else np.nan for v in value]
             axis.plot(value, at, "D", color=_RED, markersize=3.5, label="linear")
         axis.set_title(symbol(outcome))
         axis.set_yticks(at, ticks, fontsize=7.5)
@@ -188,7 +192,7 @@ def sensitivities(attrs: dict[str, Any]) -> Figure | None:
 
 
 def envelopes(data: Any) -> Figure | None:
-    """Percentile bands of the flights that are kept in full, and the failed ones among them."""
+    """Percentile bands over time of the full flights, and the failed ones among them."""
     if "history_x" not in data:
         return None
     t, x, u = (data[f"history_{name}"].values.astype(float) for name in ("t", "x", "u"))
@@ -231,7 +235,8 @@ def envelopes(data: Any) -> Figure | None:
 
 
 def _on(grid: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A history on `grid`; nothing after its end, where a law that decides it repeats the last."""
+    """A history interpolated on `grid`; NaN after its end, from which the last value is repeated if
+    the law decides the end."""
     order = np.argsort(t, kind="stable")
     return np.where(grid <= t.max(), np.interp(grid, t[order], values[order]), np.nan)
 
@@ -243,5 +248,5 @@ def _dots(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
     )  # fmt: skip
 
 
-def _number(value: Any) -> bool:
+def _finite(value: Any) -> bool:
     return value is not None and bool(np.isfinite(value))

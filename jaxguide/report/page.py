@@ -1,4 +1,4 @@
-"""The page itself: what was flown, how it went, and where to look next."""
+"""The page of a report: the sweep's inputs, its statistics and figures, its worst cases."""
 
 import html as markup
 import os
@@ -12,14 +12,15 @@ from jaxguide.sweeping import store as stores
 from jaxguide.types import RESULTS
 
 STYLE = (Path(__file__).parent / "page.css").read_text()
-_WORST = 10
+_WORST = 10  # cases in the table of the worst: half of those that a sweep keeps
 
 
 def write(store: Path, out: Path | None = None) -> Path:
-    """Writes the report of the sweep stored at `store` to `out` (default: beside it, .html) and
-    returns where.
+    """Writes the report of the sweep stored at `store` to `out` (default: beside it, .html).
 
-    **Raises:** `ValueError` where there is no sweep, or one that was not flown to its end.
+    **Returns:** the path of the file.
+
+    **Raises:** `ValueError` if there is no sweep, or one that was not flown to its end.
     """
     store = Path(store)
     out = store.with_suffix(".html") if out is None else Path(out)
@@ -32,26 +33,44 @@ def write(store: Path, out: Path | None = None) -> Path:
 
 
 def html(store: Path) -> str:
-    """The report as one HTML text: figures inside, no script, nothing to be fetched."""
-    told = stores.described(store)
-    if "summary" not in told:
+    """The report as one HTML text: figures inside, no script, nothing to be fetched.
+
+    **Raises:** `ValueError` as `write`.
+    """
+    described = stores.attributes_of(store)
+    if "summary" not in described:
         raise ValueError(
             f"{store} holds a sweep that was not flown to its end; go on with the same command "
             "and --resume."
         )
-    data = stores.opened(store)
-    manifest, attrs = told["sweep"], data.attrs
-    cases = figures.shown_cases(data)
+    data = stores.open_store(store)
+    manifest, attrs = described["sweep"], data.attrs
     name = manifest.get("label") or attrs["about"]["plant"]["class"]
     title = f"Sweep of {name}, {attrs['flown']:,} flights"
-    entries = list(next(iter(attrs["importance"].values()), {}))
     sections = [
-        _flown(manifest, attrs),
-        _outcome(attrs),
+        _inputs(manifest, attrs),
+        _failures(attrs),
         _percentiles(attrs),
+        *_drawn_sections(store, data),
+        _worst(attrs, manifest, store),
+    ]
+    body = "\n".join(section for section in sections if section)
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{_text(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"<h1>{_text(title)}</h1>\n{_headline(attrs)}\n{body}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _drawn_sections(store: Path, data: Any) -> list[str]:
+    """The sections that hold a figure or, without one, a note; "" for one with neither."""
+    attrs, cases = data.attrs, figures.shown_cases(data)
+    entries = list(next(iter(attrs["importance"].values()), {}))
+    return [
         _section(
             "How the ends are spread",
-            drawn(figures.histograms, attrs, stores.histograms(store), title="histograms"),
+            drawn(figures.histograms, attrs, stores.total_histograms(store), title="histograms"),
             "All successful flights, less the undispersed one; lines at the 1st, 50th and 99th "
             "percentiles.",
         ),
@@ -63,7 +82,7 @@ def html(store: Path) -> str:
         ),
         _section(
             "What matters",
-            drawn(figures.sensitivities, attrs, title="sensitivities"),
+            drawn(figures.variance_shares, attrs, title="sensitivities"),
             "Share of each outcome's variance that a drawn number explains by itself: bars from "
             "the flights (first-order Sobol index, 95 % bounds), diamonds from the derivatives of "
             "the undispersed flight. What is missing to 100 % is interaction, or noise.",
@@ -78,15 +97,7 @@ def html(store: Path) -> str:
             drawn(figures.envelopes, data, title="envelopes"),
             _kept(data),
         ),
-        _worst(attrs, manifest, store),
     ]
-    body = "\n".join(part for part in sections if part)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{_text(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        f"<h1>{_text(title)}</h1>\n{_headline(attrs)}\n{body}\n</main>\n</body>\n</html>\n"
-    )
 
 
 def _text(value: Any) -> str:
@@ -143,18 +154,18 @@ def _headline(attrs: dict[str, Any]) -> str:
     return f'<div class="cards">{inner}</div>'
 
 
-def _flown(manifest: dict[str, Any], attrs: dict[str, Any]) -> str:
+def _inputs(manifest: dict[str, Any], attrs: dict[str, Any]) -> str:
     about = attrs["about"]
-    flown = _number(attrs["flown"])
+    flights = _number(attrs["flown"])
     if attrs["flown"] < manifest["cases"]:
-        flown += f" of {manifest['cases']:,}; stopped by {_text(manifest['stop'])}"
+        flights += f" of {manifest['cases']:,}; stopped by {_text(manifest['stop'])}"
     plant = {k: v for k, v in about["plant"].items() if k not in ("class", "controls")}
     numbers = ", ".join(f"{k} = {_value(v)}" for k, v in plant.items())
     rows = [
         ("mission", _text(manifest.get("label") or "not of the library")),
         ("plant", f"{_text(about['plant']['class'])}<br><small>{_text(numbers)}</small>"),
         ("law", f"{_text(about['law'])}, sampled {_sampling(about['sample_interval'])}"),
-        ("flights", flown),
+        ("flights", flights),
         ("seed, sampling", f"{manifest['seed']}, {_text(attrs['sampling'].replace('_', ' '))}"),
         ("precision", _text(manifest["dtype"])),
         ("kept", _text(manifest["keep"])),
@@ -166,15 +177,15 @@ def _flown(manifest: dict[str, Any], attrs: dict[str, Any]) -> str:
     return _section("What was flown", f"{_table(('', ''), rows, 2)}<h3>Dispersions</h3>{spread}")
 
 
-def _dispersion(told: Any) -> str:
-    if isinstance(told, str):
-        return _text(told)
+def _dispersion(table: Any) -> str:
+    if isinstance(table, str):
+        return _text(table)
     inner = ", ".join(
         f"{k} {_dispersion(v) if isinstance(v, dict) else _text(_value(v))}"
-        for k, v in told.items()
+        for k, v in table.items()
         if k != "kind"
     )
-    return f"{_text(told['kind'])}: {inner}"
+    return f"{_text(table['kind'])}: {inner}"
 
 
 def _value(value: Any) -> str:
@@ -183,7 +194,7 @@ def _value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _outcome(attrs: dict[str, Any]) -> str:
+def _failures(attrs: dict[str, Any]) -> str:
     if not attrs["failures"]:
         return _section("Failures", "<p>None.</p>")
     rows = [
@@ -195,27 +206,27 @@ def _outcome(attrs: dict[str, Any]) -> str:
 
 
 def _percentiles(attrs: dict[str, Any]) -> str:
-    told = attrs["percentiles"]
-    if not told:
+    percentiles = attrs["percentiles"]
+    if not percentiles:
         return ""
     linear = dict(zip(attrs["quantities"], _roots(attrs["linear_covariance"]), strict=False))
     linear.pop("miss", None)
     values = {
-        "mean": {name: row["mean"] for name, row in told.items()},
-        "standard deviation": {name: row["std"] for name, row in told.items()},
+        "mean": {name: row["mean"] for name, row in percentiles.items()},
+        "standard deviation": {name: row["std"] for name, row in percentiles.items()},
         "the same, linear": linear,
     }
     rows: list[tuple] = [
-        (word, *(_number(of[name]) if name in of else "" for name in told))
+        (word, *(_number(of[name]) if name in of else "" for name in percentiles))
         for word, of in values.items()
     ]
-    for key in (key for key in next(iter(told.values())) if key.startswith("p")):
-        rows.append((f"{key[1:]} %", *(_bounded(row[key]) for row in told.values())))
+    for key in (key for key in next(iter(percentiles.values())) if key.startswith("p")):
+        rows.append((f"{key[1:]} %", *(_bounded(row[key]) for row in percentiles.values())))
     note = (
         "Of the successful flights. Below each percentile its 95 % bounds, by order statistics; "
         "none: too few flights for one."
     )
-    return _section("Statistics of the end", _table(("", *told), rows), note)
+    return _section("Statistics of the end", _table(("", *percentiles), rows), note)
 
 
 def _bounded(percentile: dict[str, float]) -> str:

@@ -7,9 +7,9 @@ from typing import Any
 from jaxguide.sweeping.tally import unpacked
 from jaxguide.sweeping.tiles import Order
 
-_AHEAD = 3  # chunks under way, a worker
-_RETRIES = 5  # of a chunk whose worker died
-_TIMEOUT = 10.0  # seconds until a scheduler that does not answer is given up
+_AHEAD = 3  # chunks submitted for each worker: one flown, two waiting, so that none idles
+_RETRIES = 5  # of a chunk whose worker died: more means that the chunk itself kills workers
+_TIMEOUT = 10.0  # s to wait for a scheduler's answer; a local network answers in well under one
 
 
 def over_workers(
@@ -20,8 +20,12 @@ def over_workers(
     quantities: int,
     scheduler: str,
 ) -> Iterator[tuple[int, dict, dict]]:
-    """Number, rows (those that are `kept`) and sums of each chunk, as they come; those of a worker
-    that dies are flown again by another.
+    """Flies `chunks` by the workers of a cluster; those of a worker that dies are flown again.
+
+    **Arguments:** `chunks`: number -> tiles; `each`: tiles of a whole chunk; `kept`: the variables
+    to return; `quantities`: how many have a histogram; `scheduler`: as for `jg.sweep`.
+
+    **Returns:** number, rows and sums of each chunk, in the order in which they are done.
 
     **Raises:** `ValueError` for a scheduler that does not answer, `RuntimeError` without Dask.
     """
@@ -31,11 +35,11 @@ def over_workers(
         raise RuntimeError(
             "a sweep on a cluster needs Dask; install it with pip install 'jaxguide[sweep]'."
         ) from e
-    from jaxguide.sweeping.station import fly, stationed
+    from jaxguide.sweeping.station import fly_chunk, stationed
 
     with _client(distributed, scheduler) as client, stationed(client, order) as name:
         submit = lambda k: client.submit(
-            fly, name, chunks[k], each, k, kept, retries=_RETRIES, pure=False
+            fly_chunk, name, chunks[k], each, k, kept, retries=_RETRIES, pure=False
         )
         left = iter(chunks)
         room = _AHEAD * max(len(client.scheduler_info()["workers"]), 1)
@@ -47,8 +51,8 @@ def over_workers(
             following = itertools.islice(left, 1)
             try:
                 k, rows, sums = future.result()
-            # What dies with its worker is computed again by the scheduler, but for results
-            # that it had already let go of.
+            # The scheduler computes the results of a dead worker again, except for those that it
+            # has already released.
             except distributed.CancelledError:
                 lost += 1
                 if lost > _RETRIES * len(chunks):

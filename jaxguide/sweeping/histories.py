@@ -6,23 +6,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, Prepared, simulate
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import shared
 from jaxguide.montecarlo.sampling import Points
-from jaxguide.sweeping.tiles import Order, dispersed, points_of
+from jaxguide.sweeping.tiles import Order, dispersed_case, lowered, points_of, prepared_of
 
-_LANES = 16  # flown together, the last ones filled up: one program for any number of cases
+_LANES = 16  # cases flown together; a last, short group is filled up: one program for any number
 
 
-def chosen(results: np.ndarray, successful: int, histories: int, failures: int) -> np.ndarray:
+def cases_in_full(
+    results: Int[np.ndarray, " case"], successful: int, histories: int, failures: int
+) -> Int[np.ndarray, " history"]:
     """The first `histories` cases, and the first `failures` of those that failed.
 
-    Cases are alike before they are flown, so the first are as good a sample as any, and the same
-    wherever the sweep ends.
+    Cases are independent and distributed alike, so the first are as good a sample as any, and the
+    same wherever the sweep ends.
+
+    **Arguments:** `results`: codes of all cases; `successful`: the code of success.
     """
     first = np.arange(min(histories, len(results)))
     failed = np.flatnonzero(results != successful)[:failures]
@@ -30,19 +33,20 @@ def chosen(results: np.ndarray, successful: int, histories: int, failures: int) 
 
 
 def in_full(order: Order, cases: np.ndarray) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-    """Dimensions and values of `case`, `result` (history,), `t` (history, instant), `x`, `u`."""
+    """Name -> dimensions and values of the flights of `cases`, with their histories.
+
+    `case`, `result` (history,); `t` (history, instant); `x` (history, instant, state); `u`
+    (history, sample, control). Empty without cases.
+    """
     if not len(cases):
         return {}
-    mission, dispersions = order.mission, order.dispersions
-    key = jax.random.key(order.seed)
-    spread_by = points_of(order)
-    prepared = eqx.filter_jit(shared)(mission, dispersions)
+    arguments = _arguments(order)
     padded = np.append(cases, np.full(-len(cases) % _LANES, cases[-1]))
-    flown = [
-        jax.device_get(_fly(mission, dispersions, prepared, spread_by, key, jnp.asarray(some)))
-        for some in padded.reshape(-1, _LANES)
+    flights = [
+        jax.device_get(_fly_in_full(*arguments, jnp.asarray(group)))
+        for group in padded.reshape(-1, _LANES)
     ]
-    joined = lambda of: np.concatenate([np.asarray(of(f)) for f in flown])[: len(cases)]
+    joined = lambda part: np.concatenate([np.asarray(part(f)) for f in flights])[: len(cases)]
     return {
         "case": (("history",), cases),
         "result": (("history",), joined(lambda f: f.result._value)),
@@ -52,8 +56,20 @@ def in_full(order: Order, cases: np.ndarray) -> dict[str, tuple[tuple[str, ...],
     }
 
 
+def program_in_full(order: Order) -> str:
+    """StableHLO text of the program of `in_full`: lowered, not compiled."""
+    return lowered(_fly_in_full, *_arguments(order), jnp.asarray(np.zeros(_LANES, np.int64)))
+
+
+def _arguments(
+    order: Order,
+) -> tuple[Mission, dict[Any, Distribution], Prepared | None, Points | None, Array]:
+    mission, dispersions, seeded = order.mission, order.dispersions, jax.random.key(order.seed)
+    return mission, dispersions, prepared_of(order), points_of(order), seeded
+
+
 @eqx.filter_jit
-def _fly(
+def _fly_in_full(
     mission: Mission,
     dispersions: dict[Any, Distribution],
     prepared: Prepared | None,
@@ -62,7 +78,7 @@ def _fly(
     cases: Array,
 ) -> Flight:
     def fly(case: Array) -> Flight:
-        flown, _, k_noise = dispersed(mission, dispersions, spread_by, key, case)
-        return simulate(flown, k_noise, "samples", prepared)
+        deviated, _, k_noise = dispersed_case(mission, dispersions, spread_by, key, case)
+        return simulate(deviated, k_noise, "samples", prepared)
 
     return jax.vmap(fly)(cases)

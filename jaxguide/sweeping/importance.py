@@ -1,7 +1,8 @@
-"""How much of each outcome's variance each dispersed number explains by itself. Host only.
+"""The share of each outcome's variance that each dispersed number explains by itself. Host only.
 
-First-order Sobol indices: S_i = Var(E[y | x_i]) / Var(y). From flights, by the means of y over bins
-of x_i; to first order, from the linear covariance, which knows its parts.
+First-order Sobol indices: S_i = Var(E[y | x_i]) / Var(y) (Saltelli et al., Sensitivity Analysis
+(2000)). From flights, by the means of y over bins of x_i; to first order, from the parts of the
+linear covariance.
 """
 
 import math
@@ -9,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-TILES = 64  # whose cases are looked at: with tiles of 4,096, shares to 0.4 %
-SLOTS = 64  # bins of equal probability; within one a straight line loses 0.6 % of its variance
-_UNIT = 2.0**20  # sums are of integers, so that their order does not matter: a millionth of a scale
+TILES = 64  # whose cases are used: with tiles of 4,096, shares have 95 % bounds of 0.4 %
+SLOTS = 64  # bins of equal probability; a straight line loses 0.6 % of its variance within them
+# Deviations are rounded to integers, a millionth of their scale each, so that sums do not depend
+# on their order; beyond 2^11 scales they are cut off, so that sums of 2^22 cases are exact.
+_UNIT = 2.0**20
 _FAR = 2.0**31
 
 
@@ -22,7 +25,7 @@ def edges_of(draws: np.ndarray) -> np.ndarray:
 
 
 def bin_sums(draws: np.ndarray, deviations: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """(d, SLOTS, 1 + k) integers: of each bin its cases and their summed deviations.
+    """(d, SLOTS, 1 + k) integers: for each bin, its number of cases and their summed deviations.
 
     `draws` (cases, d); `deviations` (cases, k) in units of their scale, those beyond 2^11 cut off.
     """
@@ -41,9 +44,9 @@ def first_order(sums: np.ndarray, variance: np.ndarray, scale: np.ndarray) -> np
 
     **Arguments:** `sums` of `bin_sums`; `variance`, `scale` (k,) of the outcomes.
 
-    **Error:** the chance differences of bin means are taken off (omega squared); the bounds take
-    the outcomes for normal (Olkin & Finn, Psychological Bulletin 118 (1995)). Below some thousands
-    of cases they are wide.
+    **Error:** the part of the bin means' variance that is due to chance is subtracted (omega
+    squared); the bounds assume normal outcomes (Olkin & Finn, Psychological Bulletin 118 (1995)).
+    Below some thousands of cases they are wide.
     """
     count = sums[..., 0].astype(float)
     total = count.sum(axis=1)
@@ -71,8 +74,10 @@ def linear_shares(parts: np.ndarray) -> np.ndarray:
     return np.divide(each, total, out=np.full_like(each, math.nan), where=total > 0)
 
 
-def told(names: tuple[str, ...], outcomes: tuple[str, ...], values: np.ndarray) -> dict[str, Any]:
-    """By outcome, then by name."""
+def by_outcome(
+    names: tuple[str, ...], outcomes: tuple[str, ...], values: np.ndarray
+) -> dict[str, Any]:
+    """`values` (name, outcome, ...) as dictionaries: outcome -> name -> value."""
     return {
         outcome: {name: values[i, j].tolist() for i, name in enumerate(names)}
         for j, outcome in enumerate(outcomes)

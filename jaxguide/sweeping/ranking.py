@@ -4,12 +4,16 @@ from typing import Any
 
 import numpy as np
 
-WORST = 20  # cases that are remembered
+WORST = 20  # cases that are kept: twice as many as a report shows
 
 
 def worst(measure: np.ndarray, first: int, result: np.ndarray) -> np.ndarray:
-    """(WORST, 3): measure, case number and result of those of largest `measure`, the largest
-    first; equal ones by their number. `first`: number of the first case. Rows of -1 fill up."""
+    """(WORST, 3): measure, case number and result of the cases of largest `measure`.
+
+    The largest comes first, equal ones in the order of their numbers; rows of -1 fill the table up.
+
+    **Arguments:** `measure` (cases,); `first`: number of the first case; `result` (cases,): codes.
+    """
     measure = np.where(np.isfinite(measure), measure, -1.0)
     if len(measure) > WORST:
         least = np.partition(measure, -WORST)[-WORST]
@@ -20,15 +24,15 @@ def worst(measure: np.ndarray, first: int, result: np.ndarray) -> np.ndarray:
 
 
 def merged(*tables: np.ndarray) -> np.ndarray:
-    """The worst of several tables: the same whatever their order."""
+    """The worst cases of several tables of `worst`, (WORST, 3); does not depend on their order."""
     rows = np.concatenate([np.full((WORST, 3), -1.0), *tables])
     order = np.lexsort((rows[:, 1], -rows[:, 0]))[:WORST]
-    # A filler may stand before a case without a measure: both say nothing.
+    # A case without a finite measure has -1 too, and is not ranked.
     return np.where(rows[order, :1] < 0, -1.0, rows[order])
 
 
-def told(table: np.ndarray, name: Any) -> list[dict[str, Any]]:
-    """As dictionaries; `name` gives a result's name."""
+def as_records(table: np.ndarray, name: Any) -> list[dict[str, Any]]:
+    """The rows of `table` as dictionaries; `name(code)` is the name of a result."""
     return [
         {"case": int(case), "measure": float(value), "result": name(int(result))}
         for value, case, result in table

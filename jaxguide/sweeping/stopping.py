@@ -1,7 +1,8 @@
-"""When a sweep has flown enough: rules that look at its statistics after fixed numbers of cases.
+"""Rules that stop a sweep once its statistics are good enough.
 
-A rule looks after every `LOOK` tiles, in the order of cases, however they were flown; chunks divide
-that number. So a stopped sweep has the same bits on any chunks, devices and workers.
+A rule looks at the statistics after every `LOOK` tiles, in the order of cases, in whatever order
+they were flown; chunks divide that number. So a stopped sweep has the same bits on any chunks,
+devices and workers.
 """
 
 import abc
@@ -13,26 +14,33 @@ from jaxguide.montecarlo.statistics import wilson_bounds
 from jaxguide.sweeping.tally import Tally
 from jaxguide.types import RESULTS, code
 
-LOOK = 16  # tiles between two looks; a power of two
+LOOK = 16  # tiles between two looks; a power of two, so that chunks of 1, 2, 4 ... tiles divide it
 
 
 class Stop(eqx.Module):
-    """Abstract: whether the statistics so far are good enough."""
+    """Abstract: decides whether the statistics of the cases flown are good enough to stop."""
 
     @abc.abstractmethod
     def enough(self, tally: Tally, names: tuple[str, ...], codes: Any) -> bool:
-        """`tally` of the successful cases; `codes`: cases by result."""
+        """Whether to stop.
+
+        **Arguments:** `tally`: statistics of the successful cases; `names`: its quantities; `codes`
+        (result,): number of cases by result code.
+        """
 
     @abc.abstractmethod
     def check(self, names: tuple[str, ...]) -> None:
-        """Raises `ValueError` if the sweep has no such quantity."""
+        """Checks the rule before a sweep with the quantities `names`.
+
+        **Raises:** `ValueError` if the rule is about another quantity.
+        """
 
 
 class SuccessWithin(Stop):
     """Enough when the Wilson bounds of the success rate lie at most `width` apart.
 
-    **Arguments:** `width`: on (0, 1); `confidence` of the bounds at each look. The rule looks
-    often, so a rate at the stop is a little more certain than it would be from one look.
+    **Arguments:** `width`: in (0, 1); `confidence`: of the bounds at each look. The rule stops
+    at the first look with narrow bounds, which may hold a little less often than those of one look.
     """
 
     width: float | int = eqx.field(static=True)
@@ -72,8 +80,8 @@ class PercentileWithin(Stop):
     def enough(self, tally: Tally, names: tuple[str, ...], codes: Any) -> bool:
         if tally.count < 2:
             return False
-        told = tally.percentile(names.index(self.quantity), self.percent, self.confidence)
-        return told["high"] - told["low"] <= self.width
+        bounds = tally.percentile(names.index(self.quantity), self.percent, self.confidence)
+        return bounds["high"] - bounds["low"] <= self.width
 
     def check(self, names: tuple[str, ...]) -> None:
         if self.quantity not in names:
@@ -83,7 +91,8 @@ class PercentileWithin(Stop):
 
 
 def rule(text: str) -> Stop:
-    """A rule from "success:WIDTH" or "QUANTITY:PERCENT:WIDTH", such as "miss:99:1e-6".
+    """The rule that `text` describes: "success:WIDTH", or "QUANTITY:PERCENT:WIDTH", such as
+    "miss:99:1e-6".
 
     **Raises:** `ValueError` for another form.
     """
@@ -106,5 +115,5 @@ def _positive(rule: str, width: float | int, confidence: float) -> None:
 
 
 def fitting(each: int) -> int:
-    """`each` tiles a chunk, rounded so that chunks divide the tiles between two looks."""
+    """`each` tiles a chunk, rounded up to a divisor of `LOOK`."""
     return min(1 << (each - 1).bit_length(), LOOK)

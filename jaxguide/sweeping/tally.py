@@ -1,5 +1,6 @@
-"""Sums of flights that add up to statistics, whatever chunks they come in: moments tile by tile, in
-order, and histograms of integers. A few megabytes for any number of cases. Host only."""
+"""Sums over flights from which statistics are made, the same bits whatever the chunks: moments tile
+by tile, added in order, and histograms of integers. A few megabytes for any number of cases. Host
+only."""
 
 import functools
 import math
@@ -9,8 +10,8 @@ import numpy as np
 
 from jaxguide.montecarlo.statistics import PERCENTILES, normal_quantile
 
-# A histogram over the exponents and first bits of a float's own representation: bins of relative
-# width 2^-12 for deviations from 2^-40 to 2^24 of their scale, and no range to choose beforehand.
+# A histogram whose bins are the exponents and first 12 mantissa bits of a float: bins of relative
+# width 2^-12 for deviations from 2^-40 to 2^24 of their scale, so that no range must be chosen.
 _BITS, _LOWEST, _OCTAVES = 12, -40, 64
 _SPAN = _OCTAVES << _BITS
 BINS = 2 * _SPAN
@@ -39,18 +40,25 @@ class Tally:
 
     @property
     def mean(self) -> np.ndarray:
+        """(k,); the centre without cases."""
         return self.centre + self.sums / max(self.count, 1)
 
     @property
     def covariance(self) -> np.ndarray:
+        """(k, k), unbiased; zero below two cases."""
         if self.count < 2:
             return np.zeros_like(self.squares)
         off = self.sums / self.count
         return (self.squares - self.count * np.outer(off, off)) / (self.count - 1)
 
     def percentile(self, i: int, percent: float, confidence: float = 0.95) -> dict[str, float]:
-        """Of quantity `i`, with distribution-free bounds from order statistics: the number of
-        samples below a quantile is binomial."""
+        """Percentile of quantity `i`: `value`, and its bounds `low`, `high` at `confidence`.
+
+        The bounds assume no distribution: the number of samples below a quantile is binomial, so
+        they are order statistics; infinite where the sample is too small for one.
+
+        **Source:** David & Nagaraja, Order Statistics (2003), section 7.1.
+        """
         p, n = percent / 100, self.count
         cumulative = np.cumsum(self.histogram[i])
         spread = normal_quantile(0.5 + confidence / 2) * math.sqrt(n * p * (1 - p))
@@ -80,13 +88,17 @@ class Tally:
 
 
 def tile_moments(deviations: np.ndarray) -> np.ndarray:
-    """(1 + k + k^2,): count, sums and products of the rows; by loops of one order, not by BLAS."""
+    """(1 + k + k^2,): count, sums and summed products of the rows (cases, k).
+
+    By loops of one fixed order, not by BLAS, whose order depends on its threads.
+    """
     products = np.einsum("ij,ik->jk", deviations, deviations)
     return np.concatenate([[len(deviations)], deviations.sum(axis=0), products.ravel()])
 
 
 def count_in(histogram: np.ndarray, deviations: np.ndarray) -> None:
-    """Adds each column of `deviations`, in units of their scale, to its row of `histogram`."""
+    """Counts each column of `deviations` (cases, k), in units of its scale, in its row of
+    `histogram` (k, BINS), in place."""
     bits = np.ascontiguousarray(deviations.T).view(np.int64)
     key = np.clip(((bits & (2**63 - 1)) >> (52 - _BITS)) - _BASE, 0, _SPAN - 1)
     key = np.where(bits < 0, _SPAN - 1 - key, _SPAN + key)
@@ -95,14 +107,13 @@ def count_in(histogram: np.ndarray, deviations: np.ndarray) -> None:
 
 
 def packed(histogram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places and counts of the bins that are not empty: a chunk's go over a network in a tenth of
-    the bytes or less."""
+    """Indices and counts of the bins that are not empty: at most a tenth of the bytes to send."""
     at = np.flatnonzero(histogram)
     return at.astype(np.int32), histogram.ravel()[at].astype(np.int32)
 
 
 def unpacked(packet: Any, quantities: int) -> np.ndarray:
-    """The histogram (quantities, BINS) that `packed` packed."""
+    """The histogram (quantities, BINS) from the indices and counts of `packed`."""
     at, counts = packet
     histogram = np.zeros(quantities * BINS, np.int64)
     histogram[at] = counts
@@ -110,7 +121,7 @@ def unpacked(packet: Any, quantities: int) -> np.ndarray:
 
 
 def edges_of_bins() -> np.ndarray:
-    """(BINS + 1,): where the bins of a histogram begin and end, in units of the scale."""
+    """(BINS + 1,): the edges of the bins of a histogram, in units of the scale."""
     positive = _edge(np.arange(_SPAN + 1))
     return np.concatenate([-positive[::-1], positive[1:]])
 
@@ -121,7 +132,7 @@ def _edge(key: Any) -> Any:
 
 
 def _order_statistic(cumulative: np.ndarray, rank: int) -> float:
-    """The `rank`-th value, from 0, if values are even within its bin."""
+    """The `rank`-th value, from 0, taking values as evenly spread within a bin."""
     i = int(np.searchsorted(cumulative, rank, side="right"))
     i = min(i, BINS - 1)
     before = cumulative[i - 1] if i else 0

@@ -1,4 +1,4 @@
-"""Dispersions as text: read from a TOML or YAML file, and written as plain data. Host only."""
+"""Dispersions as plain data: read from a TOML or YAML file, and written again. Host only."""
 
 import dataclasses
 import difflib
@@ -46,11 +46,11 @@ def dispersions_from(source: Any) -> dict[Any, Distribution]:
 
     **Returns:** path (a tuple of paths for several) -> distribution, as `jg.sweep` takes it.
 
-    **Raises:** `ValueError` that names the file, the key, the value and the remedy; `OSError` where
+    **Raises:** `ValueError` that names the file, the key, the value and the remedy; `OSError` if
     there is no such file.
     """
     if isinstance(source, dict):
-        return {path: _distribution(told, path) for path, told in _tables(source, "")}
+        return {path: _distribution(table, path) for path, table in _tables(source, "")}
     file = Path(source)
     try:
         return dispersions_from(_parsed(file))
@@ -59,11 +59,11 @@ def dispersions_from(source: Any) -> dict[Any, Distribution]:
 
 
 def as_written(dispersions: dict[Any, Distribution]) -> dict[str, Any] | None:
-    """What `dispersions_from` would read back, as plain data; None for classes that it does not
-    know."""
+    """`dispersions` as plain data that `dispersions_from` reads back; None if one of them is of a
+    class that it does not know."""
     try:
         return {
-            path if isinstance(path, str) else ", ".join(path): _told(distribution)
+            path if isinstance(path, str) else ", ".join(path): _table_of(distribution)
             for path, distribution in dispersions.items()
         }
     except TypeError:
@@ -81,16 +81,16 @@ def _parsed(file: Path) -> dict[str, Any]:
     except ImportError as e:
         raise ValueError("YAML needs PyYAML; install it, or write TOML.") from e
     try:
-        told = yaml.safe_load(file.read_text())  # makes plain data only
+        tables = yaml.safe_load(file.read_text())  # makes plain data only
     except yaml.YAMLError as e:
         raise ValueError(f"is no plain YAML: {e}") from e
-    if not isinstance(told, dict):
-        raise ValueError("holds no tables; see jg.dispersions_from for what to write.")
-    return told
+    if not isinstance(tables, dict):
+        raise ValueError("holds no tables; see jg.dispersions_from for the form.")
+    return tables
 
 
 def _tables(source: dict[str, Any], prefix: str) -> Any:
-    """(path, table) of each table with a kind; those without one lead on to others."""
+    """(path, table) of each table with a `kind`; a table without one holds other tables."""
     for key, value in source.items():
         path = f"{prefix}{key}"
         if not isinstance(value, dict):
@@ -107,31 +107,31 @@ def _tables(source: dict[str, Any], prefix: str) -> Any:
             yield from _tables(value, f"{path}.")
 
 
-def _distribution(told: Any, path: Any) -> Distribution:
+def _distribution(table: Any, path: Any) -> Distribution:
     name = path if isinstance(path, str) else ", ".join(path)
-    if not isinstance(told, dict) or "kind" not in told:
-        raise ValueError(f"{name} is {told!r}; give a table with a kind.")
-    kind = KINDS.get(str(told["kind"]))
+    if not isinstance(table, dict) or "kind" not in table:
+        raise ValueError(f"{name} is {table!r}; give a table with a kind.")
+    kind = KINDS.get(str(table["kind"]))
     if kind is None:
-        near = difflib.get_close_matches(str(told["kind"]), KINDS, 1)
+        near = difflib.get_close_matches(str(table["kind"]), KINDS, 1)
         hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(KINDS)}."
-        raise ValueError(f"{name}: kind is {told['kind']!r}; {hint}")
+        raise ValueError(f"{name}: kind is {table['kind']!r}; {hint}")
     fields = {field.name: field for field in dataclasses.fields(kind)}
     given = {}
-    for key, value in told.items():
+    for key, value in table.items():
         if key == "kind":
             continue
         if key not in fields:
             near = difflib.get_close_matches(key, fields, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(fields)}."
-            raise ValueError(f"{name}: {told['kind']} has no {key!r}; {hint}")
+            raise ValueError(f"{name}: {table['kind']} has no {key!r}; {hint}")
         if key == "distribution":
             given[key] = _distribution(value, f"{name}.distribution")
         else:
             given[key] = _numbers(value, f"{name}: {key}")
     missing = [k for k, f in fields.items() if f.default is dataclasses.MISSING and k not in given]
     if missing:
-        raise ValueError(f"{name}: {told['kind']} needs {', '.join(missing)}; give it.")
+        raise ValueError(f"{name}: {table['kind']} needs {', '.join(missing)}; give it.")
     try:
         return kind(**given)
     except ValueError as e:
@@ -150,14 +150,17 @@ def _numbers(value: Any, where: str) -> Any:
     raise ValueError(f"{where} is {value!r}; give a number or a list of numbers.")
 
 
-def _told(distribution: Distribution) -> dict[str, Any]:
+def _table_of(distribution: Distribution) -> dict[str, Any]:
+    """The table from which `_distribution` makes `distribution`.
+
+    **Raises:** `TypeError` for a class that is none of `KINDS`.
+    """
     names = {kind: name for name, kind in KINDS.items()}
     if type(distribution) not in names:
         raise TypeError(type(distribution))
-    told: dict[str, Any] = {"kind": names[type(distribution)]}
+    table: dict[str, Any] = {"kind": names[type(distribution)]}
     for field in dataclasses.fields(distribution):
         value = getattr(distribution, field.name)
-        told[field.name] = (
-            _told(value) if isinstance(value, Distribution) else np.asarray(value, float).tolist()
-        )
-    return told
+        nested = isinstance(value, Distribution)
+        table[field.name] = _table_of(value) if nested else np.asarray(value, float).tolist()
+    return table

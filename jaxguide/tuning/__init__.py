@@ -3,9 +3,6 @@
 from jaxguide.tuning.counts import Count as Count
 from jaxguide.tuning.counts import counted as counted
 from jaxguide.tuning.counts import exhaustive as exhaustive
-from jaxguide.tuning.designs import Ascending as Ascending
-from jaxguide.tuning.designs import Bounded as Bounded
-from jaxguide.tuning.designs import values as values
 from jaxguide.tuning.flown import Flown as Flown
 from jaxguide.tuning.loop import tune as tune
 from jaxguide.tuning.measures import cost as cost
@@ -28,3 +25,6 @@ from jaxguide.tuning.risk import quantile as quantile
 from jaxguide.tuning.risk import quantile_bounds as quantile_bounds
 from jaxguide.tuning.risk import smooth_quantile as smooth_quantile
 from jaxguide.tuning.thinned import ThinnedGains as ThinnedGains
+from jaxguide.tuning.variables import Ascending as Ascending
+from jaxguide.tuning.variables import Bounded as Bounded
+from jaxguide.tuning.variables import values as values

@@ -1,5 +1,5 @@
-"""From a relaxed count to a true one: rounded, flown as what it is, and its neighbours beside it.
-Host only."""
+"""A relaxed count rounded to an integer, and the true objective there and at its neighbours. Host
+only."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -10,8 +10,9 @@ import numpy as np
 class Count(NamedTuple):
     """A count found by gradient, checked at true integers.
 
-    `relaxed`, `relaxed_loss`: as tuned. `count`, `loss`: the integer chosen, and the true objective
-    there. `beside`: integer -> true objective, of the rounded count and those next to it.
+    `relaxed`, `relaxed_loss`: the real count and its objective, as tuned. `count`, `loss`: the best
+    integer, and the true objective there. `beside`: integer -> true objective, of the rounded count
+    and of those next to it.
     """
 
     relaxed: float
@@ -33,12 +34,12 @@ def counted(
     least: int = 1,
     most: int | None = None,
 ) -> Count:
-    """Rounds a relaxed count and says what one more or less would do.
+    """Rounds a relaxed count and compares it with one more and one less.
 
-    **Arguments:** `true(n)`: the objective with the true integer n, no relaxation left; `least`,
-    `most`: integers that there are.
+    **Arguments:** `true(n)`: the objective with the integer n, without any relaxation; `least`,
+    `most`: the smallest and the largest integer allowed.
 
-    **Returns:** a Count; the best of the rounded one and its two neighbours.
+    **Returns:** a Count: the best of the rounded integer and its two neighbours.
 
     **Raises:** `ValueError` for a count outside `least` ... `most`, or if no objective is finite.
     """
@@ -52,9 +53,9 @@ def counted(
 
 
 def exhaustive(true: Callable[[int], Any], counts: Iterable[int]) -> dict[int, float]:
-    """The true objective of every count; those that are not finite count as infinite.
+    """The true objective of every count; one that is not finite is set to infinity.
 
-    **Raises:** `ValueError` where none is finite.
+    **Raises:** `ValueError` if none is finite.
     """
     found = {n: float(true(n)) for n in counts}
     found = {n: v if np.isfinite(v) else np.inf for n, v in found.items()}

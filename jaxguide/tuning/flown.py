@@ -10,24 +10,24 @@ from jaxtyping import Array
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, simulate
 from jaxguide.montecarlo.dispersions import Distribution
-from jaxguide.montecarlo.rollouts import apply, draw, shared
+from jaxguide.montecarlo.rollouts import draw, shared, with_deviations
 from jaxguide.tuning.measures import endpoint_miss
 
 Measure = Callable[[Mission, Flight], Any]
 
 
 class Flown(eqx.Module):
-    """`flown(mission, keys)`: what `measure` says of each case's flight, a leading case axis added.
+    """A function of (mission, keys (cases,)): flies a dispersed case for each key and returns its
+    `measure`, with a leading case axis.
 
-    Case k is case k of `jg.sweep` with the same seed. Cases are flown `chunk` at a time, and flown
-    again when the gradient comes back: reverse mode keeps one chunk's samples, whatever the number
-    of cases.
+    Case k is case k of `jg.sweep` with the same seed. Cases are flown `chunk` at a time, and again
+    in the backward pass, so that reverse mode stores the samples of one chunk only.
 
     **Arguments:**
 
     - `dispersions`: path (or paths, as a tuple) -> distribution, as for `jg.sweep`.
-    - `measure(mission, flight)`: of one flight, and the mission as dispersed: a scalar, or any
-      pytree of arrays. Default `endpoint_miss`.
+    - `measure(mission, flight)`: of the dispersed mission and its flight: a scalar, or any pytree
+      of arrays. Default `endpoint_miss`.
     - `save`: "ends", or "samples" where the measure looks at histories.
     - `chunk`: cases flown at once.
     """
@@ -48,8 +48,8 @@ class Flown(eqx.Module):
 
         def fly(key: Array) -> Any:
             k_draw, k_noise = jax.random.split(key)
-            flown = apply(mission, draw(mission, self.dispersions, k_draw))
-            return self.measure(flown, simulate(flown, k_noise, self.save, prepared))
+            deviated = with_deviations(mission, draw(mission, self.dispersions, k_draw))
+            return self.measure(deviated, simulate(deviated, k_noise, self.save, prepared))
 
         again = jax.checkpoint(fly)  # pyright: ignore[reportPrivateImportUsage]
         return jax.lax.map(again, keys, batch_size=self.chunk)

@@ -1,4 +1,4 @@
-"""What is measured of one flight of a mission: (mission as flown, flight) -> a number."""
+"""Measures of one flight: (dispersed mission, flight) -> a number."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,23 +8,31 @@ from jaxguide.bounds import bounds_of
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, sample_times
 
+_EMPTY = 1e-12  # of the horizon: a shorter sample is one of no length, up to rounding
+
 
 def endpoint_miss(mission: Mission, flight: Flight) -> Float[Array, ""]:
-    """Euclidean norm of how far the plant's endpoint constraints are off at the end, in their own
-    units. Weigh them by a measure of your own where the units differ."""
+    """By how much the plant's endpoint constraints are missed, Euclidean norm, in their own units.
+
+    Where the units differ, write a measure that weighs them.
+    """
     plant = mission.plant
     at = (mission.initial_state, flight.final_state, mission.initial_time, flight.final_time)
     e = plant.endpoint_constraints(*at)
     lo, hi = bounds_of(plant.endpoint_bounds, e.shape[0], e.dtype)
     off = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
     squares = jnp.sum(off**2)
-    # The root's derivative at zero is taken as zero.
+    # The derivative of the root at zero is set to zero.
     return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
 
 
 def cost(mission: Mission, flight: Flight) -> Float[Array, ""]:
-    """Cost of the flight: the plant's endpoint cost, and its running cost by the trapezoidal rule
-    on the samples (save="samples"; with "ends" only a Problem without one is measured rightly)."""
+    """Cost of the flight: the plant's endpoint cost plus the integral of its running cost.
+
+    Needs save="samples", unless the plant has no running cost.
+
+    **Error:** of the trapezoidal rule on the samples.
+    """
     plant = mission.plant
     at = (mission.initial_state, flight.final_state, mission.initial_time, flight.final_time)
     u = jnp.concatenate([flight.u, flight.u[-1:]])
@@ -35,14 +43,17 @@ def cost(mission: Mission, flight: Flight) -> Float[Array, ""]:
 
 
 def effort(mission: Mission, flight: Flight) -> Float[Array, ""]:
-    """Integral of the squared deviation of the control from its nominal; exact where a hold keeps
-    it over each sample. Needs save="samples"."""
+    """Integral of the squared deviation of the control from its nominal. Needs save="samples".
+
+    **Error:** exact if the hold keeps the deviation over each sample.
+    """
     return jnp.sum(flight.commands**2 * jnp.diff(flight.t)[:, None])
 
 
 def gain_evaluations(mission: Mission) -> int:
-    """How often the law is asked in a whole flight, for which it stores as many gains: samples of
-    some length. Host only, for missions that are no traces; while tuning, use the relaxed count.
+    """Number of samples of positive length in a whole flight: at each the law evaluates one gain.
+
+    Host only, for a mission without traced values; in an objective use the relaxed count.
     """
     times = np.asarray(sample_times(mission))
-    return int(np.sum(np.diff(times) > 1e-12 * (times[-1] - times[0])))
+    return int(np.sum(np.diff(times) > _EMPTY * (times[-1] - times[0])))

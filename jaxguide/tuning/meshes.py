@@ -1,4 +1,4 @@
-"""How wrong a direct solution is between its nodes, as a smooth function of its mesh."""
+"""The error of a direct solution between its nodes, as a smooth function of its mesh."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,13 @@ from jaxguide.trajectory import Extremal
 
 
 def mesh_error(extremal: Extremal) -> Float[Array, ""]:
-    """Integral over the horizon of |dx/dt - f|^2, relative to the state's span, between the nodes,
-    the control being cut to its bounds: no vehicle flies what its polynomial does beyond them.
+    r"""Integral over the horizon of $|dx/dt - f(t, x, \bar u)|^2$, each state relative to its span.
 
-    Zero only where dynamics and bounds hold everywhere: with controls that switch, on a mesh that
-    has breaks at the switches. Smooth in the breaks but where a control touches its bound; there
-    are local minima where nodes, not breaks, meet a switch: fewer of them on few nodes a segment.
+    x and u are the polynomials of the solution, between its nodes too; $\bar u$ is u clipped to its
+    bounds, as a vehicle would fly it. The error is zero only if dynamics and bounds hold
+    everywhere: for a control that switches, if the mesh has breaks at the switches. It is smooth in
+    the breaks except where a control touches its bound. It has local minima where a node instead of
+    a break meets a switch; there are fewer of them with few nodes a segment.
 
     **Error:** quadrature exact for polynomials of twice the degree.
     """

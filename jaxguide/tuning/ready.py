@@ -8,15 +8,16 @@ from jaxguide.tuning.record import Tuned
 
 
 class Ready(NamedTuple):
-    """A named design.
+    """A named design with all that `jg.tune` needs.
 
     - `objective`, `design`, `build`, `optimizer`, `temperature`: as `jg.tune` takes them.
-    - `steps`, `cases`: what its author found enough. Without dispersions `cases` is 1.
-    - `confirm(tuned, cases, seed)`: rows of a table (name -> start, tuned) with true integers on
-      fresh cases, and `notes` on what was found.
-    - `places(design)`: name -> places on a line, from 0 to 1, to draw before and after.
-    - `rounded(tuned)`: the design with its count made an integer, to tune what is left; None where
-      there is nothing to round.
+    - `about`: what is tuned, in a line.
+    - `steps`, `cases`: enough by experiment on this design. Without dispersions `cases` is 1.
+    - `confirm(tuned, cases, seed)`: the start and the tuned design compared with true integers on
+      fresh cases.
+    - `places(design)`: name -> numbers from 0 to 1, drawn on a line before and after tuning.
+    - `rounded(tuned)`: the design with its count fixed at an integer, whose other leaves are tuned
+      next; None if there is no count.
     """
 
     name: str
@@ -40,7 +41,7 @@ class Ready(NamedTuple):
         seed: int = 0,
         **options: Any,
     ) -> Tuned:
-        """Tunes it, as it is: relaxed, if it is; `options` as for `jg.tune`."""
+        """Tunes the design; its counts stay relaxed. `options`: as for `jg.tune`."""
         given: dict[str, Any] = {
             "steps": self.steps if steps is None else steps,
             "cases": self.cases if cases is None else cases,
@@ -56,8 +57,8 @@ class Ready(NamedTuple):
 class Confirmed(NamedTuple):
     """Before and after, on true integers and fresh cases.
 
-    `rows`: what -> (start, tuned); `beside`: of a count, integer -> true objective; `notes`: in
-    words. `better`: whether the tuned design does what it was tuned for.
+    `rows`: name of a quantity -> its value at (start, tuned); `beside`: for a count, integer ->
+    true objective; `notes`: sentences. `better`: whether the tuned design is better than the start.
     """
 
     rows: dict[str, tuple[float, float]]

@@ -1,4 +1,4 @@
-"""What a tuning run leaves: the design found and how it got there. Host only."""
+"""The outcome of a tuning run and the record of its steps. Host only."""
 
 import os
 from pathlib import Path
@@ -6,21 +6,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxguide.tuning.designs import values
+from jaxguide.tuning.variables import values
 
-HISTORY = "history.npz"
+HISTORY = "history.npz"  # the file in the folder of a run
 
 
 class Tuned(NamedTuple):
     """Outcome of `jg.tune`.
 
-    - `design`: the best seen, as `build` takes it; `raw`: the same as the optimiser has it, to go
-      on from. `start`: the design at the start.
-    - `loss`: of the best; `at`: its step. Where a temperature falls, the best at its lowest.
-    - `history`: by step: `loss`, `gradient_norm`, `temperature` if there is one, `term:NAME` of
-      what else the objective returned, `design:PATH` of every leaf.
-    - `stopped`: "steps", "tolerance" or "not finite"; `message`: the same in words.
-    - `compile_s`, `step_s`: seconds to compile, and of a warm step.
+    - `design`: the best design, as `build` takes it; `raw`: the same as the optimiser has it, from
+      which another run can start. `start`: the design at the start.
+    - `loss`: of the best design; `at`: its step. Where a temperature falls, the best is that at the
+      lowest temperature.
+    - `history`: arrays by step: `loss`, `gradient_norm`, `temperature` if there is one, `term:NAME`
+      for every other value of the objective, `design:PATH` for every leaf.
+    - `stopped`: "steps", "tolerance" or "not finite"; `message`: the reason as a sentence.
+    - `compile_s`, `step_s`: seconds to compile, and of a compiled step.
     """
 
     design: Any
@@ -42,10 +43,10 @@ class Tuned(NamedTuple):
         )
 
 
-class History:
-    """Rows of a run as they come, written to `folder` now and then.
+class Recorder:
+    """Collects a row of numbers for each step of a run, and writes them to `folder`, if any.
 
-    A file is replaced by a whole one, so that a killed run leaves the last.
+    A file is replaced by a whole one, so that a killed run leaves the last that was written.
     """
 
     def __init__(self, folder: Path | None):
@@ -54,13 +55,16 @@ class History:
             folder.mkdir(parents=True, exist_ok=True)
 
     def add(self, row: dict[str, Any]) -> None:
+        """Adds the row of one step: column -> value."""
         self.rows.append({name: np.asarray(value) for name, value in row.items()})
 
     def columns(self) -> dict[str, np.ndarray]:
+        """Column -> values (step, ...); those of the first row's names."""
         names = self.rows[0] if self.rows else {}
         return {name: np.stack([row[name] for row in self.rows]) for name in names}
 
     def write(self) -> None:
+        """Replaces the file by one with all rows; nothing without a folder."""
         if self.folder is None:
             return
         final, part = self.folder / HISTORY, self.folder / f".{HISTORY}.{os.getpid()}"
@@ -75,9 +79,9 @@ class History:
 
 
 def load_history(folder: Any) -> dict[str, np.ndarray]:
-    """`Tuned.history` as saved by `jg.tune(..., out=folder)`; nothing in the file is executed.
+    """`Tuned.history` as written by `jg.tune(..., out=folder)`; no code in the file is executed.
 
-    **Raises:** `ValueError` where there is none.
+    **Raises:** `ValueError` if there is no such file.
     """
     path = Path(folder) / HISTORY
     if not path.is_file():
@@ -87,7 +91,7 @@ def load_history(folder: Any) -> dict[str, np.ndarray]:
 
 
 def on_host(design: Any) -> Any:
-    """Values of a design, off the device."""
+    """The values of `design`, `Bounded` and `Ascending` replaced by theirs, as NumPy arrays."""
     import jax
 
     return jax.tree_util.tree_map(np.asarray, jax.device_get(values(design)))

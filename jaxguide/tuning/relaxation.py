@@ -1,9 +1,9 @@
 """Counts as real numbers, so that they have a gradient: each relaxation is exact at integers.
 
-Three kinds. *Samples*: a real count spreads them, counted back from the end, so that a new one
-enters at the start with no length. *Stored nodes*: each is there with some probability, and what is
-flown is the mean over which are. *Modes*: an order at which they are cut off, softly. The last two
-are cooled by a temperature until they are what they stand for.
+Three kinds. *Samples*: a real count spreads them, counted back from the end, so that a new sample
+enters at the start with no length. *Stored nodes*: each is kept with some probability, and the mean
+over all choices of nodes is flown. *Modes*: a soft cutoff at a real order. The last two have a
+temperature, which falls until every node or mode is either kept or left out.
 """
 
 from collections.abc import Callable
@@ -15,23 +15,23 @@ from jaxtyping import Array, Float
 
 from jaxguide.spectral import legendre_matrix, legendre_vandermonde, nodes_lg
 
-_POINTS = 32  # of the density's quadrature: rounding, for weights of a few modes
+_POINTS = 32  # of the quadrature of a density: exact to rounding for weights of a few modes
 
 
 def sample_lengths(count: Any, most: int, horizon: Any, shape: Any = None) -> Float[Array, " most"]:
     r"""Lengths of up to `most` samples whose number is the real `count`: `Mission`'s
     `sample_interval`.
 
-    With $s_j = min(j/count, 1)$ sample j from the end begins at time to go $T g(s_j)$, g growing
-    from 0 to 1. At an integer count these are that many samples, the others having no length.
-    Between, the *first* sample is short. Counted from the start, $t_k = min(k \delta, t_f)$, the
-    last one would be: as continuous, but a gain to a hard end grows without bound as the time to go
-    vanishes, and the objective would swing between any two integers.
+    With $s_j = min(j/count, 1)$, sample j from the end begins at time to go $T g(s_j)$, where g
+    grows from 0 to 1. At an integer count there are as many samples of positive length. Between
+    two integers the *first* sample is short. Counted from the start, $t_k = min(k \delta, t_f)$,
+    the last one would be short: as continuous, but a gain to a hard end grows without bound as the
+    time to go vanishes, and the objective would oscillate between any two integers.
 
-    **Arguments:** `horizon`: T; `shape` (d,): Legendre weights, order 1 ... d on [-1, 1] from the
-    end to the start, of the logarithm of g's slope; none: evenly.
+    **Arguments:** `horizon`: T; `shape` (d,): the coefficients of order 1 ... d of the logarithm of
+    g's slope in Legendre polynomials on [-1, 1], from the end to the start; None: even samples.
 
-    **Error:** of the integral of the slope: rounding for weights of order one.
+    **Error:** rounding, for coefficients of order one.
     """
     count = jnp.asarray(count)
     j = jnp.arange(most + 1).astype(count.dtype)
@@ -41,7 +41,7 @@ def sample_lengths(count: Any, most: int, horizon: Any, shape: Any = None) -> Fl
 
 
 def _grown(shape: Float[Array, " d"], s: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Integral of exp(sum shape_i P_i) from 0 to s, of that to 1."""
+    """Integral of exp(sum shape_i P_i) from 0 to s, divided by the integral from 0 to 1."""
     dtype = s.dtype
     points = jnp.asarray(nodes_lg(_POINTS)[0], dtype)
     log_slope = legendre_vandermonde(points, shape.shape[0] + 1)[:, 1:] @ shape
@@ -55,38 +55,44 @@ def _grown(shape: Float[Array, " d"], s: Float[Array, " k"]) -> Float[Array, " k
 
 
 def cutoff(count: Any, size: int, temperature: Any) -> Float[Array, " size"]:
-    r"""Weights of `size` ordered things (Legendre modes, say) of which `count` are kept:
-    $\sigma((count - k - 1/2)/temperature)$. Cooled, the first `count` rounded."""
+    r"""Weights of `size` ordered terms (Legendre modes, say) of which `count` are kept:
+    $\sigma((count - k - 1/2)/temperature)$ for term k = 0, 1, ...
+
+    As the temperature falls to 0, they become 1 for the first `count` terms, rounded, else 0.
+    """
     count = jnp.asarray(count)
     k = jnp.arange(size).astype(count.dtype)
     return jax.nn.sigmoid((count - k - 0.5) / temperature)
 
 
-def priced(share: Float[Array, " thing"]) -> Float[Array, ""]:
-    """The number of things that are there in part, as an objective should pay for them: the sum of
-    1 - (1 - share)^2, a half costing three quarters.
+def priced(share: Float[Array, " term"]) -> Float[Array, ""]:
+    r"""The number of terms that are kept in part, as an objective should charge for them:
+    $\sum_k 1 - (1 - share_k)^2$, so that a half costs three quarters.
 
-    What is left of a squared error falls as (1 - share)^2 as its term comes in, faster than the
-    share, so that paid by the share alone a thing is best kept in part, however cold. Paid so, the
-    sum is linear in (1 - share)^2, and best at an end.
+    As a term enters, the squared error that it removes falls as $(1 - share)^2$. Charged by the
+    share itself, a term would be best kept in part at any temperature. Charged so, the objective is
+    linear in $(1 - share)^2$, and best where the term is kept or left out.
     """
     return jnp.sum(1 - (1 - share) ** 2)
 
 
 def occupancy(logits: Float[Array, " node"], temperature: Any) -> Float[Array, " node"]:
-    """How far each node is there, from 0 to 1; cooled, it is or is not."""
+    r"""The probability that each node is kept, $\sigma(logit/temperature)$.
+
+    As the temperature falls to 0, it becomes 0 or 1.
+    """
     return jax.nn.sigmoid(logits / temperature)
 
 
 def thinned_weights(
     places: Float[Array, " node"], present: Float[Array, " node"], t: Any
 ) -> Float[Array, " node"]:
-    """What each node's value weighs at `t` in the mean of linear interpolation over all ways to
-    leave nodes out, node i being there with probability `present[i]`, independently. The first and
-    the last always are. Beyond them the nearest line goes on.
+    """Weights of the nodes' values at `t`: the mean of linear interpolation over all choices of
+    nodes, node i being kept with probability `present[i]`, independently of the others.
 
-    At zeros and ones it is plain interpolation between the nodes that are there; it is multilinear
-    in `present`, so that no kink lies between.
+    The first and the last node are always kept; beyond them the nearest line is extended. Where all
+    probabilities are 0 or 1 it is linear interpolation between the nodes kept; it is multilinear in
+    `present`, so it has no kink in between.
     """
     n = places.shape[0]
     inner = jnp.arange(n)
@@ -94,9 +100,9 @@ def thinned_weights(
     present = jnp.where(ends, 1.0, present)
     absent = 1 - present
     after = jnp.searchsorted(places, t, side="right", method="compare_all")
-    at = jnp.clip(after - 1, 0, n - 2)  # the node to the left, were all there
+    at = jnp.clip(after - 1, 0, n - 2)  # the node to the left, if all were kept
     left = inner <= at.astype(inner.dtype)
-    # Probability that i is the nearest there is to the left: it is there, none between is.
+    # Probability that i is the nearest node kept to the left: it is kept, none between is.
     gap_left = jnp.cumprod(jnp.where(left, absent, 1.0)[::-1])[::-1]
     gap_left = jnp.append(gap_left[1:], 1.0)
     gap_right = jnp.cumprod(jnp.where(left, 1.0, absent))

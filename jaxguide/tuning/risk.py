@@ -1,4 +1,4 @@
-"""From one number per flight to one number: quantiles, tail means, and soft bounds."""
+"""One number for many flights: quantiles, tail means, and soft bounds."""
 
 import functools
 from typing import Any
@@ -15,25 +15,27 @@ from jaxguide.montecarlo.statistics import normal_quantile
 def quantile(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Array, ""]:
     """The `level` quantile, linear between order statistics.
 
-    Its derivative is that of the two cases beside it: exact, and as noisy as that sounds; see
+    Its derivative depends only on the two cases next to the quantile: exact, but noisy; see
     `smooth_quantile`.
 
     **Raises:** `ValueError` for a level outside (0, 1).
     """
-    _check(level, "quantile")
+    _check_level(level, "quantile")
     return jnp.quantile(jnp.asarray(values), level)
 
 
 def smooth_quantile(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Array, ""]:
-    """Harrell and Davis's estimate of a quantile: a mean of all order statistics with the weights
-    of a beta distribution about `level`. Less scatter than `quantile`, and a derivative from many
-    cases; biased outwards where the tail is long and cases are few.
+    """Harrell and Davis's estimate of a quantile: a mean of all order statistics, weighted by a
+    beta distribution about `level`.
+
+    It scatters less than `quantile`, and its derivative depends on many cases; it is biased
+    outwards where the tail is long and cases are few.
 
     **Raises:** `ValueError` for a level outside (0, 1).
 
     **Source:** Harrell & Davis, Biometrika 69 (1982).
     """
-    _check(level, "smooth_quantile")
+    _check_level(level, "smooth_quantile")
     weights = _harrell_davis(values.shape[0], level)
     return jnp.sum(jnp.asarray(weights, values.dtype) * jnp.sort(values))
 
@@ -47,21 +49,22 @@ def _harrell_davis(count: int, level: float) -> np.ndarray:
 def cvar(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Array, ""]:
     r"""Mean of the worst 1 - `level` of the cases: $\min_a a + E[(v - a)^+]/(1 - level)$.
 
-    The least is at the quantile, so that its derivative (Danskin's theorem) leaves `a` where it is;
-    a case that straddles the level counts in part.
+    The minimum is at the quantile, so its derivative is taken at fixed `a` (Danskin's theorem); a
+    case at the quantile is counted in part.
 
     **Raises:** `ValueError` for a level outside (0, 1).
 
     **Source:** Rockafellar & Uryasev, Journal of Risk 2 (2000), eq. (9).
     """
-    _check(level, "cvar")
+    _check_level(level, "cvar")
     values, count = jnp.asarray(values), values.shape[0]
-    # The order statistic below which `level` of the cases lie: a minimiser, whichever is taken.
+    # The order statistic with `level` of the cases below it; any minimiser would do. 1e-9 absorbs
+    # the rounding of level * count where that is an integer.
     rank = min(int(np.ceil(level * count - 1e-9)), count) - 1
     a = jax.lax.stop_gradient(jnp.sort(values)[max(rank, 0)])
     excess = jnp.where(values > a, values - a, 0.0)
-    # Cases at `a` itself share what of the tail the cases beyond it leave (zero in value, and the
-    # rest of the derivative).
+    # Cases at `a` share the part of the tail that cases beyond it do not fill; they add nothing to
+    # the value, and the rest of the derivative.
     at = (values == a).astype(values.dtype)
     beyond = jnp.sum((values > a).astype(values.dtype))
     share = jnp.maximum((1 - level) * count - beyond, 0.0) / jnp.sum(at)
@@ -69,11 +72,12 @@ def cvar(values: Float[Array | np.ndarray, " case"], level: float) -> Float[Arra
 
 
 def above(value: Any, bound: Any, width: Any = 0.0) -> Float[Array, ""]:
-    """How far `value` is above `bound`, squared, of its size: a soft constraint for an objective,
-    zero where it is met. With a `width` (of the bound) the corner is rounded, and what is met by
-    less than that pays a little too.
+    r"""Soft constraint of an objective: $\max(value/bound - 1, 0)^2$, zero where it is met.
 
     Relative to the bound, so that one weight serves misses and loads.
+
+    **Arguments:** `width`: rounds the corner, $\max(y, 0)$ becoming $w\,\mathrm{softplus}(y/w)$; a
+    value less than `width` (of the bound) below it then costs a little too.
     """
     off = jnp.asarray(value) / bound - 1
     if isinstance(width, (int, float)) and width == 0:
@@ -81,7 +85,7 @@ def above(value: Any, bound: Any, width: Any = 0.0) -> Float[Array, ""]:
     return (width * jax.nn.softplus(off / width)) ** 2
 
 
-def _check(level: float, name: str) -> None:
+def _check_level(level: float, name: str) -> None:
     if not 0 < level < 1:
         raise ValueError(f"{name}: level is {level}; give a fraction in (0, 1), such as 0.99.")
 
@@ -91,7 +95,7 @@ def quantile_bounds(
 ) -> tuple[float, float, float]:
     """(low, quantile, high): distribution-free bounds from order statistics, the number of cases
     below a quantile being binomial. Host only."""
-    _check(level, "quantile_bounds")
+    _check_level(level, "quantile_bounds")
     ordered = np.sort(np.asarray(values, float))
     n = ordered.size
     spread = normal_quantile(0.5 + confidence / 2) * np.sqrt(n * level * (1 - level))

@@ -1,4 +1,4 @@
-"""Stored gain stations that may be left out, as a law's interpolation."""
+"""Interpolation of a law's gains between stations, each of which may be left out."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from jaxguide.tuning.relaxation import thinned_weights
 
 
 class ThinnedGains(Interpolation):
-    """`jg.TimeToGoGains` with stations that are there only in part: the mean over which are.
+    """`jg.TimeToGoGains` in the mean over the stations that are kept.
 
-    **Arguments:** `powers` (n,): as there; `present` (g,): probability of each station. The first
-    and the last always are there.
+    **Arguments:** `powers` (n,): as in `jg.TimeToGoGains`; `present` (g,): the probability
+    with which each station is kept; the first and the last always are.
     """
 
     powers: Any
@@ -27,11 +27,13 @@ class ThinnedGains(Interpolation):
         left = lambda tau: (1 - tau) ** powers
         scale = jax.vmap(left)(stations)[:, None, :]
         mean = lambda tau: thinned_weights(stations, self.present, tau)
-        least = (1 - last) * 1e-3  # no gain is infinite
+        # As in `jg.TimeToGoGains`: the time to go below which gains no longer grow, so that they
+        # stay finite at the end.
+        least = (1 - last) * 1e-3
         now = left(1 - jnp.maximum(1 - tau, least))[None, :]
         w, on = mean(jnp.minimum(tau, last)), mean(tau)
         time = (1 - stations)[:, None] * schedule.K_time
-        # The next node is `ahead` of the place itself, not of the stations that are there.
+        # The spacing to the node ahead is that of the schedule, not that of the stations kept.
         spacing = jnp.where(tau < last, w @ schedule.spacing, jnp.maximum(1 - tau, least))
         return Gains(
             jnp.tensordot(w, schedule.here * scale, 1) / now,

@@ -20,13 +20,13 @@ from jaxguide.problems.earth_mars import CAP, SAMPLE_INTERVAL, EarthMars, disper
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.tuning.counts import Count, counted
-from jaxguide.tuning.designs import Bounded
 from jaxguide.tuning.flown import Flown
 from jaxguide.tuning.measures import cost, endpoint_miss, gain_evaluations
 from jaxguide.tuning.ready import Confirmed, Ready
 from jaxguide.tuning.record import Tuned
 from jaxguide.tuning.relaxation import sample_lengths
 from jaxguide.tuning.risk import above, quantile_bounds, smooth_quantile
+from jaxguide.tuning.variables import Bounded
 
 LEVEL = 0.99  # of the percentile
 MOST = 166  # samples of 0.02 TU in 3.32

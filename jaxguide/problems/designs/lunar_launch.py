@@ -28,12 +28,12 @@ from jaxguide.problems.lunar_launch import (
 )
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
-from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.flown import Flown
 from jaxguide.tuning.ready import Confirmed, Ready
 from jaxguide.tuning.record import Tuned
 from jaxguide.tuning.relaxation import cooling, occupancy
 from jaxguide.tuning.thinned import ThinnedGains
+from jaxguide.tuning.variables import Ascending
 
 NODES, STATIONS = 9, 7  # the thesis's nodes; from the last two the end cannot be controlled
 WEIGHTS = (1.0, 0.1, 0.1)  # of squared errors of y [ft], u and v [ft/s] at the end (chosen)

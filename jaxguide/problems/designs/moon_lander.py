@@ -15,10 +15,10 @@ from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.problems.vehicles import MoonLander
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
-from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.meshes import mesh_error
 from jaxguide.tuning.ready import Confirmed, Ready
 from jaxguide.tuning.record import Tuned
+from jaxguide.tuning.variables import Ascending
 
 # Coarse, so that the places of the breaks matter; 1e-10, as gradients are of the converged solve.
 METHOD = Pseudospectral(nodes=3, tolerance=1e-10, refinements=0)

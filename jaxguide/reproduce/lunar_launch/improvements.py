@@ -15,8 +15,8 @@ from jaxguide.problems.lunar_launch import LunarLaunch, mission
 from jaxguide.reproduce.lunar_launch.flights import TARGET, fly_plants, thesis_mission
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
-from jaxguide.tuning.designs import Ascending
 from jaxguide.tuning.loop import tune
+from jaxguide.tuning.variables import Ascending
 
 # Weights of squared errors of y [ft], u and v [ft/s] at the end: the thesis's law leaves up to
 # 75 ft and 3 ft/s, so y dominates.

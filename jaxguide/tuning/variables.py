@@ -1,9 +1,9 @@
-"""Where a design may go: leaves that are kept within bounds or in order by smooth maps.
+"""The variables of a design: leaves that smooth maps keep within bounds or in order.
 
 A design is any pytree of floating arrays. An optimiser moves unconstrained numbers; a `Bounded` or
 `Ascending` node holds such numbers and stands for their image, which alone `build` sees. Compared
 with clipping after each step, the map has no corner at which momentum and gradient disagree, and
-the derivative is that of the objective as stated; its price is that a bound is approached, never
+the derivative is that of the objective as stated; in return, a bound is approached and never
 reached.
 """
 
@@ -19,14 +19,14 @@ from jaxtyping import Array, Float
 
 
 class Mapped(eqx.Module):
-    """Abstract: numbers `raw` that stand for `value`."""
+    """Abstract: a leaf whose `value` is the image of unconstrained numbers `raw`."""
 
     raw: eqx.AbstractVar[Array]
 
     @property
     @abc.abstractmethod
     def value(self) -> Array:
-        """What `build` is given."""
+        """The image of `raw`, which `build` is given."""
 
 
 class Bounded(Mapped):
@@ -72,11 +72,12 @@ class Bounded(Mapped):
 
 
 class Ascending(Mapped):
-    """Places in order from `lo` to `hi`, both kept: the shares of the spacings are a softmax.
+    r"""Ascending numbers $v_1 < \ldots < v_k$, the first and the last fixed; the spacings are
+    $(v_k - v_1)\,\mathrm{softmax}(raw)$.
 
-    **Arguments:** `value` (k,): where to start, ascending; the first is `lo` and the last `hi`.
+    **Arguments:** `value` (k,): where to start, ascending.
 
-    **Raises:** `ValueError` for places out of order, or fewer than three, which leave none to move.
+    **Raises:** `ValueError` for numbers out of order, or fewer than three, of which none can move.
     """
 
     raw: Float[Array, " k_1"]
@@ -109,7 +110,8 @@ def values(design: Any) -> Any:
 
 
 def named(design: Any) -> dict[str, Any]:
-    """Leaves by their path, such as "nodes" or "law.gain"; of a lone array, "design"."""
+    """The leaves of `design` by their path, such as "nodes" or "law.gain"; a design that is one
+    array has the name "design"."""
     found = jax.tree_util.tree_flatten_with_path(design)[0]
     return {_name(path): leaf for path, leaf in found}
 
@@ -122,9 +124,9 @@ def _name(path: tuple) -> str:
 
 
 def checked(design: Any) -> Any:
-    """`design` with numbers made arrays.
+    """`design` with its numbers as JAX arrays.
 
-    **Raises:** `ValueError` for a leaf that is not floating or not finite, or for no leaf at all.
+    **Raises:** `ValueError` for a leaf that is not floating or not finite, or if there is no leaf.
     """
     leaves = named(design)
     if not leaves:
