@@ -96,8 +96,9 @@ def test_a_command_keeps_the_deviation_apart(law):
 def test_holds(law):
     command, _ = law(0.2, jnp.array([0.2, 0.5]), None)
     du, u = command.deviation(0.2), command.nominal(0.2)
-    deviation, control = jg.HoldDeviation()(command, 0.2), jg.HoldControl()(command, 0.2)
-    assert jg.History()(command, 0.2) is command
+    deviation, _ = jg.HoldDeviation()(command, 0.2, None)
+    control, _ = jg.HoldControl()(command, 0.2, None)
+    assert jg.History()(command, 0.2, None)[0] is command
     np.testing.assert_array_equal(deviation.deviation(0.27), du)
     np.testing.assert_array_equal(deviation.nominal(0.27), command.nominal(0.27))
     np.testing.assert_array_equal(control.deviation(0.27), du)
@@ -220,15 +221,18 @@ class Noise(eqx.Module):
         return x + self.noise * jax.random.normal(key, x.shape, x.dtype)
 
 
-class Blend(eqx.Module):
+class Blend(jg.Estimator):
     """Half the measurement, half the last estimate."""
 
     def start(self, x0):
         return x0
 
-    def __call__(self, t, y, memory):
+    def predict(self, memory, flown, t, t_next):
+        return memory
+
+    def update(self, memory, t, y):
         x = (y + memory) / 2
-        return x, x
+        return jg.Estimate(x), x
 
 
 def test_sensor_and_estimator(mission):

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxguide.laws.gain_interpolation import Gains, Interpolation
+from jaxguide.laws.gain_interpolation import Interpolation, StationGains
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
 from jaxguide.tuning.relaxation import thinned_weights
 
@@ -20,7 +20,7 @@ class ThinnedGains(Interpolation):
     powers: Any
     present: Any
 
-    def __call__(self, schedule: SuboptimalSchedule, tau: Any) -> Gains:
+    def __call__(self, schedule: SuboptimalSchedule, tau: Any) -> StationGains:
         stations = schedule.stations
         powers = jnp.asarray(self.powers, stations.dtype)
         last = stations[-1]
@@ -33,7 +33,7 @@ class ThinnedGains(Interpolation):
         time = (1 - stations)[:, None] * schedule.K_time
         # The next node is `ahead` of the place itself, not of the stations that are there.
         spacing = jnp.where(tau < last, w @ schedule.spacing, jnp.maximum(1 - tau, least))
-        return Gains(
+        return StationGains(
             jnp.tensordot(w, schedule.here * scale, 1) / now,
             jnp.tensordot(w, schedule.ahead * scale, 1) / now,
             on @ time,
