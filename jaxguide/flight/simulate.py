@@ -13,7 +13,7 @@ from jaxguide.flight.estimators import PlainEstimator
 from jaxguide.flight.integrators import StagedIntegrator
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.sample import Loop, Span, asked, begin, flown_across
-from jaxguide.laws.lanes import GridLaw, SampleGrid, StagedHold
+from jaxguide.laws.lanes import GridLaw, SampleGrid, StagedHold, vouches
 from jaxguide.laws.law import Law
 from jaxguide.types import RESULTS
 
@@ -51,18 +51,17 @@ class Prepared(NamedTuple):
 
 def prepare(mission: Mission) -> Prepared:
     """The part of a flight that depends on time alone: of use before a batch."""
-    times, integrator, law = sample_times(mission), mission.integrator, mission.law
+    times = sample_times(mission)
     holds = [hold for hold in (mission.hold, mission.last) if hold is not None]
+    law, integrator = mission.law, mission.integrator
     fast = (
-        isinstance(law, GridLaw)
-        and not law.decides_end
-        and isinstance(integrator, StagedIntegrator)
-        and all(isinstance(hold, StagedHold) for hold in holds)
-        and (mission.actuator is None or isinstance(mission.actuator, StagedActuator))
+        not law.decides_end
+        and all(vouches(hold, StagedHold) for hold in holds)
+        and (mission.actuator is None or vouches(mission.actuator, StagedActuator))
         # Any other estimator may ask for the control that was flown at any time.
         and (mission.estimator is None or isinstance(mission.estimator, PlainEstimator))
     )
-    if not fast:
+    if not (fast and vouches(law, GridLaw) and vouches(integrator, StagedIntegrator, "across")):
         return Prepared(times, None, None)
     stages = jnp.asarray(integrator.stages, times.dtype)
     grid = SampleGrid(times[:-1], times[:-1, None] + jnp.diff(times)[:, None] * stages[None, :])

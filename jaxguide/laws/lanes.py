@@ -10,7 +10,7 @@ flown by the plain contracts, with the same result to rounding.
 """
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeGuard, TypeVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -20,6 +20,7 @@ from jaxguide.laws.law import Command, Hold, Law
 # A vector as a tuple of scalars: under `vmap` each becomes one contiguous array of flights, which
 # is what makes a batch of flights fast on a CPU.
 Lanes = tuple[Any, ...]
+Known = TypeVar("Known", bound=eqx.Module)
 
 
 def lanes(vector: Float[Array, " k"]) -> Lanes:
@@ -78,3 +79,11 @@ def staged(command: Command) -> StagedCommand:
     if not isinstance(command, StagedCommand):
         raise TypeError(f"{type(command).__name__} is not known at an integrator's stages.")
     return command
+
+
+def vouches(part: Any, contract: type[Known], method: str = "__call__") -> TypeGuard[Known]:
+    """Whether `part` keeps the fast path's `contract`: the class that defines its `method` derives
+    from the contract directly. One that derives from such a class and writes the method anew does
+    not vouch for it, and is flown by the plain contracts."""
+    author = next((c for c in type(part).__mro__ if method in c.__dict__), None)
+    return author is not None and contract in author.__bases__
