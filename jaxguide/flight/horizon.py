@@ -5,7 +5,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxguide.laws.law import Law
 from jaxguide.laws.plain import fulfilled
@@ -21,7 +20,7 @@ _ROUNDING = 1e-12
 _NO_SAMPLE = 1e-9
 
 
-def horizon(plant: Problem, law: Law, initial_time: Any, final_time: Any) -> tuple[Any, Any]:
+def horizon(plant: Problem, law: Any, initial_time: Any, final_time: Any) -> tuple[Any, Any]:
     """First and last time of a mission: those given, or else the plant's, or else the law's latest
     end if it decides the end.
 
@@ -51,11 +50,10 @@ def sample_count(
 
     **Raises:** `ValueError` for an interval or a number of samples that does not fit.
     """
-    cast = jnp.asarray(interval, dtype)
-    t0, tf = jnp.asarray(ends[0], dtype), jnp.asarray(ends[1], dtype)
-    traced = is_traced((cast, t0, tf))
-    if cast.ndim:
-        max_samples = _one_length_each(law, cast, None if traced else (t0, tf), max_samples)
+    # What was given decides: under a trace, even a number becomes a tracer once it is an array.
+    traced = is_traced((interval, ends))
+    if jnp.ndim(interval):
+        max_samples = _one_length_each(law, interval, None if traced else ends, dtype, max_samples)
     elif not traced:
         number = lambda a: float(np.asarray(a))
         count = _samples_within(number(interval), number(ends[0]), number(ends[1]))
@@ -77,12 +75,13 @@ def sample_count(
 
 
 def _one_length_each(
-    law: Law, lengths: Array, ends: tuple[Array, Array] | None, max_samples: int | None
+    law: Law, lengths: Any, ends: tuple[Any, Any] | None, dtype: Any, max_samples: int | None
 ) -> int:
     """The number of samples whose lengths are given one by one; `ends`: None under a trace."""
-    if lengths.ndim != 1 or not lengths.size or max_samples not in (None, lengths.size):
+    shape = jnp.shape(lengths)
+    if len(shape) != 1 or not shape[0] or max_samples not in (None, shape[0]):
         raise ValueError(
-            f"Mission: sample_interval has shape {lengths.shape} and max_samples is {max_samples}; "
+            f"Mission: sample_interval has shape {shape} and max_samples is {max_samples}; "
             "give one number, or a vector of the lengths of all samples and no max_samples."
         )
     if law.decides_end:
@@ -91,19 +90,20 @@ def _one_length_each(
             "samples cannot be given ahead; give one sample_interval."
         )
     if ends is not None:
-        host, span = np.asarray(lengths), float(ends[1] - ends[0])
+        host, t0, tf = (np.asarray(a).astype(dtype) for a in (lengths, *ends))
+        span = float(tf - t0)
         if not np.all(np.isfinite(host)) or np.any(host < 0):
             k = int(np.argmax(~np.isfinite(host) | (host < 0)))
             raise ValueError(
                 f"Mission: sample_interval[{k}] is {host[k]}; give finite lengths, none below 0."
             )
-        slack = 4 * lengths.size * float(jnp.finfo(lengths.dtype).eps)  # a rounding each, and more
+        slack = 4 * host.size * float(jnp.finfo(dtype).eps)  # a rounding each, and some more
         if abs(host.sum() - span) > slack * abs(span):
             raise ValueError(
                 f"Mission: sample_interval adds up to {host.sum()}, but the horizon is {span} "
                 "long; scale the lengths to it."
             )
-    return lengths.size
+    return shape[0]
 
 
 def _samples_within(interval: float, t0: float, tf: float) -> int:

@@ -78,7 +78,7 @@ class Mission(eqx.Module):
     def __init__(
         self,
         plant: Problem,
-        law: Law,
+        law: Any,
         initial_state: Any,
         sample_interval: Any,
         *,
@@ -93,7 +93,7 @@ class Mission(eqx.Module):
         final_time: Any = None,
         miss: Any = None,
         max_samples: int | None = None,
-        integrator: Integrator | None = None,
+        integrator: Any = None,
     ):
         if not isinstance(delay, (int, float)) or delay != 0.0:
             raise ValueError(
