@@ -37,8 +37,6 @@ class Line(jg.Command):
 class FirstOrder(jg.Hold):
     """The deviation goes on along the line through this sample and the last."""
 
-    controls: int = 1
-
     def start(self):
         # No line through one sample: none has been seen at the time of -inf.
         return jnp.asarray(-jnp.inf), jnp.zeros(1)
