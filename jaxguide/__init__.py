@@ -13,9 +13,16 @@ if TYPE_CHECKING:
     from jaxguide.certificate import Certificate as Certificate
     from jaxguide.certificate import Certified as Certified
     from jaxguide.certificate import certify as certify
+    from jaxguide.flight.actuators import Actuator as Actuator
+    from jaxguide.flight.actuators import ControlLimits as ControlLimits
+    from jaxguide.flight.disturbances import Disturbance as Disturbance
+    from jaxguide.flight.estimators import Estimate as Estimate
+    from jaxguide.flight.estimators import Estimator as Estimator
     from jaxguide.flight.integrators import Adaptive as Adaptive
+    from jaxguide.flight.integrators import Integrator as Integrator
     from jaxguide.flight.integrators import RungeKutta4 as RungeKutta4
     from jaxguide.flight.mission import Mission as Mission
+    from jaxguide.flight.sensors import Sensor as Sensor
     from jaxguide.flight.simulate import Flight as Flight
     from jaxguide.flight.simulate import simulate as simulate
     from jaxguide.laws.gain_interpolation import LinearGains as LinearGains
@@ -24,6 +31,7 @@ if TYPE_CHECKING:
     from jaxguide.laws.holds import HoldControl as HoldControl
     from jaxguide.laws.holds import HoldDeviation as HoldDeviation
     from jaxguide.laws.law import Command as Command
+    from jaxguide.laws.law import Hold as Hold
     from jaxguide.laws.law import Law as Law
     from jaxguide.laws.law import OpenLoop as OpenLoop
     from jaxguide.laws.neighboring import NeighboringOptimal as NeighboringOptimal
@@ -74,19 +82,26 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "Actuator": "flight.actuators",
     "Adaptive": "flight.integrators",
     "Bellman": "solving.bellman",
     "Capabilities": "nominal.method",
     "Certificate": "certificate",
     "Certified": "certificate",
     "Command": "laws.law",
+    "ControlLimits": "flight.actuators",
+    "Disturbance": "flight.disturbances",
+    "Estimate": "flight.estimators",
+    "Estimator": "flight.estimators",
     "Extremal": "trajectory",
     "Flight": "flight.simulate",
     "Free": "problem",
     "GainSchedule": "neighboring.gains",
     "History": "laws.holds",
+    "Hold": "laws.law",
     "HoldControl": "laws.holds",
     "HoldDeviation": "laws.holds",
+    "Integrator": "flight.integrators",
     "Law": "laws.law",
     "LinearGains": "laws.gain_interpolation",
     "LinearTPBVP": "neighboring.linearization",
@@ -108,6 +123,7 @@ _HOME = {
     "RESULTS": "types",
     "Relative": "montecarlo.dispersions",
     "RungeKutta4": "flight.integrators",
+    "Sensor": "flight.sensors",
     "Shooting": "nominal.indirect.shooting",
     "SolveError": "types",
     "StateAsTime": "transforms.state_as_time",

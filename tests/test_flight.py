@@ -15,6 +15,7 @@ import pytest
 from conftest import DoubleIntegrator, FreeTime, at
 
 import jaxguide as jg
+from jaxguide.flight.simulate import prepare
 from jaxguide.sweeping.sweep import cast
 
 START = (0.1, -0.1)
@@ -96,8 +97,9 @@ def test_a_command_keeps_the_deviation_apart(law):
 def test_holds(law):
     command, _ = law(0.2, jnp.array([0.2, 0.5]), None)
     du, u = command.deviation(0.2), command.nominal(0.2)
-    deviation, control = jg.HoldDeviation()(command, 0.2), jg.HoldControl()(command, 0.2)
-    assert jg.History()(command, 0.2) is command
+    deviation, _ = jg.HoldDeviation()(command, 0.2, None)
+    control, _ = jg.HoldControl()(command, 0.2, None)
+    assert jg.History()(command, 0.2, None)[0] is command
     np.testing.assert_array_equal(deviation.deviation(0.27), du)
     np.testing.assert_array_equal(deviation.nominal(0.27), command.nominal(0.27))
     np.testing.assert_array_equal(control.deviation(0.27), du)
@@ -124,6 +126,37 @@ def test_cap_and_scale(law):
     for cap in (0.0, -1.0, math.nan):
         with pytest.raises(ValueError, match=f"cap is {cap}; give a positive bound"):
             dataclasses.replace(law, cap=cap)
+
+
+class Halved(jg.NeighboringOptimal):
+    """Derived from a law that can be looked up, but commands otherwise."""
+
+    def __call__(self, t_k, x, memory):
+        return dataclasses.replace(self.law_within(), scale=0.5)(t_k, x, memory)
+
+    def law_within(self):
+        return jg.NeighboringOptimal(self.schedule, self.cap, self.scale)
+
+
+def test_the_fast_path_is_not_inherited(mission, law):
+    halved = Halved(law.schedule)
+    assert prepare(mission).laws is not None
+    assert prepare(dataclasses.replace(mission, law=halved)).laws is None
+    flown, known = (
+        simulate(dataclasses.replace(mission, law=one))
+        for one in (halved, dataclasses.replace(law, scale=0.5))
+    )
+    # One by the plain contracts, the other by gains looked up: rounding times gains of 600.
+    np.testing.assert_allclose(flown.x, known.x, rtol=0, atol=1e-12)
+
+
+def test_a_prepared_command_does_not_answer_at_other_times(mission):
+    first = jax.tree_util.tree_map(lambda a: a[0], prepare(mission).laws)
+    command, _ = first(0.0, jnp.asarray(START), None)
+    np.testing.assert_allclose(command(0.0), [6 - 0.2], rtol=0, atol=1e-8)
+    for ask in (command.nominal, command.deviation, command):
+        with pytest.raises(ValueError, match="asked for its control at another time"):
+            ask(0.05)
 
 
 # Flights against a loop by hand ---------------------------------------------------------------
@@ -220,15 +253,18 @@ class Noise(eqx.Module):
         return x + self.noise * jax.random.normal(key, x.shape, x.dtype)
 
 
-class Blend(eqx.Module):
+class Blend(jg.Estimator):
     """Half the measurement, half the last estimate."""
 
     def start(self, x0):
         return x0
 
-    def __call__(self, t, y, memory):
+    def predict(self, memory, flown, t, t_next):
+        return memory
+
+    def update(self, memory, t, y):
         x = (y + memory) / 2
-        return x, x
+        return jg.Estimate(x), x
 
 
 def test_sensor_and_estimator(mission):

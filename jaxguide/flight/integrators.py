@@ -1,4 +1,4 @@
-"""How a flight is integrated across one sample."""
+"""Integrators: how a flight is flown from one sample to the next."""
 
 import abc
 from collections.abc import Callable
@@ -11,22 +11,66 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.laws.lanes import Lanes, lanes
+from jaxguide.laws.law import Command
 from jaxguide.types import RESULTS
 
 Rate = Callable[[Any, Any, Any], Any]  # (t, x, u) -> dx/dt
 
 
 class Integrator(eqx.Module):
-    """Abstract: see RungeKutta4 and Adaptive."""
+    """Abstract: flies the vehicle across one sample.
+
+    A pytree; whatever fixes its amount of work (steps, orders) is a static field. It must work
+    under `jit`, `vmap` and `grad`, and never raises for what a number is.
+    """
+
+    @abc.abstractmethod
+    def across(
+        self, rate: Rate, flown: Command, t: Any, t_next: Any, x: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], RESULTS]:
+        """The state at the next sample.
+
+        **Arguments:** `rate(t, x, u)` -> (n,): dx/dt of the plant with its disturbances, for a time
+        (), a state (n,) and a control (m,); `flown`: `flown(s)` is the control (m,) at any time s
+        from `t` to `t_next`; `t`, `t_next` (): the sample's beginning and end, which may be one and
+        the same (the state is then `x`); `x` (n,): state at `t`.
+
+        **Returns:** the state (n,) at `t_next`, in the dtype of `x`, and `jg.RESULTS.successful` or
+        another result. Then, or where the state is not finite, the flight is `diverged`, its state
+        held at the last finite one.
+        """
+
+
+class StagedIntegrator(Integrator):
+    """Abstract: an integrator with fixed stages, for the fast path (see `jaxguide.laws.lanes`)."""
 
     @property
     @abc.abstractmethod
-    def stages(self) -> tuple[float, ...] | None:
-        """Fractions of the sample at which the control is asked; None if not known ahead."""
+    def stages(self) -> tuple[float, ...]:
+        """The fractions of the sample at which the control is asked for, from 0 to 1."""
+
+    @abc.abstractmethod
+    def across_stages(
+        self,
+        rate: Rate,
+        t: Any,
+        width: Any,
+        x: Lanes,
+        nominal: tuple[Lanes, ...],
+        deviation: tuple[Lanes, ...],
+    ) -> Lanes:
+        """The state after a sample of length `width`, of which the nominal and the deviation of the
+        control are given at `stages`; one deviation alone is constant over the sample. `rate` takes
+        and returns Lanes."""
 
 
-class RungeKutta4(Integrator):
-    """The classical fourth-order method, `steps` equal steps a sample. Made for batches."""
+class RungeKutta4(StagedIntegrator):
+    """The classical fourth-order method, `steps` equal steps a sample. Made for batches.
+
+    **Error:** of fourth order in the sample interval over `steps`.
+
+    **Raises:** `ValueError` for less than one step.
+    """
 
     steps: int = eqx.field(static=True, default=2)
 
@@ -39,6 +83,16 @@ class RungeKutta4(Integrator):
         return tuple(i / (2 * self.steps) for i in range(2 * self.steps + 1))
 
     def across(
+        self, rate: Rate, flown: Command, t: Any, t_next: Any, x: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], RESULTS]:
+        t, t_next = jnp.asarray(t, x.dtype), jnp.asarray(t_next, x.dtype)
+        controls = jax.vmap(flown)(t + (t_next - t) * jnp.asarray(self.stages, x.dtype))
+        asked = tuple(lanes(controls[j]) for j in range(len(self.stages)))
+        none = (tuple(jnp.zeros_like(u) for u in asked[0]),)
+        final = self.across_stages(stacked(rate), t, t_next - t, lanes(x), asked, none)
+        return jnp.stack(final), RESULTS.successful
+
+    def across_stages(
         self,
         rate: Rate,
         t: Any,
@@ -47,13 +101,9 @@ class RungeKutta4(Integrator):
         nominal: tuple[Lanes, ...],
         deviation: tuple[Lanes, ...],
     ) -> Lanes:
-        """State after the sample, from the controls at its stage times (`stages`); a `deviation`
-        of one entry is held over the sample.
-
-        The four stages are a scan: XLA's CPU backend recomputes shared work in every output of a
-        fused loop, and a loop carry is the one cut it respects (unrolled, this is ten times
-        slower). Each sum adds the slope of the turn before, which is at hand.
-        """
+        # The four stages are a scan: XLA's CPU backend recomputes shared work in every output of a
+        # fused loop, and a loop carry is the one cut it respects (unrolled, this is ten times
+        # slower). Each sum adds the slope of the turn before, which is at hand.
         h = width / self.steps
         held = deviation[0] if len(deviation) == 1 else None
         order = [[2 * i, 2 * i + 1, 2 * i + 1, 2 * i + 2] for i in range(self.steps)]
@@ -82,7 +132,15 @@ class RungeKutta4(Integrator):
 
 
 class Adaptive(Integrator):
-    """Diffrax's Dopri8 to a tolerance: reference flights, one at a time."""
+    """Diffrax's Dopri8 to a tolerance: for reference flights, one at a time.
+
+    **Arguments:** `tolerance`: relative and absolute, of each step's error in the state;
+    `max_steps` a sample.
+
+    **Error:** of the order of `tolerance`.
+
+    **Raises:** `ValueError` for a tolerance outside (0, 1) or less than one step.
+    """
 
     tolerance: float = eqx.field(static=True, default=1e-11)
     max_steps: int = eqx.field(static=True, default=1024)
@@ -93,19 +151,16 @@ class Adaptive(Integrator):
         if self.max_steps < 1:
             raise ValueError(f"Adaptive: max_steps is {self.max_steps}; give at least 1.")
 
-    @property
-    def stages(self) -> None:
-        return None
-
     def across(
-        self, rate: Any, t: Any, end: Any, x: Float[Array, " n"]
+        self, rate: Rate, flown: Command, t: Any, t_next: Any, x: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], RESULTS]:
-        """State at `end`, flown from `t` with dx/dt = rate(t, x)."""
+        # Diffrax takes no interval without length: one of length 1 is flown instead, and not used.
+        empty = t_next == t
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, x, args: rate(t, x)),
+            diffrax.ODETerm(lambda t, x, args: rate(t, x, flown(t))),
             diffrax.Dopri8(),
             t,
-            end,
+            t + jnp.where(empty, 1.0, t_next - t),
             None,
             x,
             stepsize_controller=diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance),
@@ -114,7 +169,8 @@ class Adaptive(Integrator):
             throw=False,
         )
         assert solution.ys is not None
-        return solution.ys[0], RESULTS.promote(solution.result)
+        result = RESULTS.where(empty, RESULTS.successful, RESULTS.promote(solution.result))
+        return jnp.where(empty, x, solution.ys[0]), result
 
 
 def _move(x: Lanes, h: Any, k: Lanes) -> Lanes:
@@ -125,8 +181,8 @@ def _stack(entries: list[Lanes]) -> Lanes:
     return tuple(jnp.stack(component) for component in zip(*entries, strict=True))
 
 
-def stacked(rate: Callable[[Any, Array, Any], Array]) -> Rate:
-    """A user's rate of stacked states, for states held as tuples: stacked only here."""
+def stacked(rate: Rate) -> Rate:
+    """A rate of arrays as a rate of Lanes: stacked only where the user's function is called."""
 
     def call(t: Any, x: Lanes, u: Lanes) -> Lanes:
         return lanes(rate(t, jnp.stack(x), jnp.stack(u)))

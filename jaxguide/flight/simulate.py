@@ -7,15 +7,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.bounds import bounds_of
-from jaxguide.flight.integrators import Adaptive, RungeKutta4, stacked
+from jaxguide.bounds import overstep
+from jaxguide.flight.actuators import StagedActuator
+from jaxguide.flight.estimators import PlainEstimator
+from jaxguide.flight.integrators import StagedIntegrator
 from jaxguide.flight.mission import Mission
-from jaxguide.laws.lanes import SampleGrid
-from jaxguide.laws.law import Command, Law
+from jaxguide.flight.sample import Loop, Span, asked, begin, flown_across
+from jaxguide.laws.lanes import GridLaw, SampleGrid, StagedHold, vouches
+from jaxguide.laws.law import Law
 from jaxguide.types import RESULTS
 
-# Of the sample interval: a law's time to go below which a flight is done (thesis: 1e-6 s of 4).
-END = 2.5e-7
+# The time to go, as a fraction of the sample interval, below which a flight is over (the thesis
+# takes 1e-6 s, with samples of 4 s).
+_OVER = 2.5e-7
 
 
 class Flight(eqx.Module):
@@ -36,30 +40,32 @@ class Flight(eqx.Module):
     result: RESULTS
 
 
-class _Carry(eqx.Module):
-    x: tuple[Array, ...]
-    memory: Any
-    estimate: Any
-    saturated: Array
-    result: RESULTS
-
-
 class Prepared(NamedTuple):
-    """Sample times of a mission and its law made ready for them: shared by a batch of flights."""
+    """What depends on time alone, shared by a batch of flights: the sample times of a mission and,
+    of one that can be flown fast, the stage times and the law looked up at them (else None)."""
 
     times: Float[Array, " instant"]
-    grid: SampleGrid
+    grid: SampleGrid | None
     laws: Law | None
 
 
 def prepare(mission: Mission) -> Prepared:
-    """The part of a fixed-step flight that depends on time alone."""
+    """The part of a flight that depends on time alone: of use before a batch."""
     times = sample_times(mission)
-    fixed = isinstance(mission.integrator, RungeKutta4)
-    stages = jnp.asarray(mission.integrator.stages or (0.0, 1.0), times.dtype)
+    holds = [hold for hold in (mission.hold, mission.last) if hold is not None]
+    law, integrator = mission.law, mission.integrator
+    fast = (
+        not law.decides_end
+        and all(vouches(hold, StagedHold) for hold in holds)
+        and (mission.actuator is None or vouches(mission.actuator, StagedActuator))
+        # Any other estimator may ask for the control that was flown at any time.
+        and (mission.estimator is None or isinstance(mission.estimator, PlainEstimator))
+    )
+    if not (fast and vouches(law, GridLaw) and vouches(integrator, StagedIntegrator, "across")):
+        return Prepared(times, None, None)
+    stages = jnp.asarray(integrator.stages, times.dtype)
     grid = SampleGrid(times[:-1], times[:-1, None] + jnp.diff(times)[:, None] * stages[None, :])
-    histories = any(hold is not None and hold.uses_history for hold in (mission.hold, mission.last))
-    return Prepared(times, grid, mission.law.prepared(grid, histories) if fixed else None)
+    return Prepared(times, grid, law.prepared(grid, any(hold.uses_history for hold in holds)))
 
 
 def simulate(
@@ -67,108 +73,40 @@ def simulate(
 ) -> Flight:
     """Flies `mission` once.
 
-    **Arguments:** `key`: a PRNG key, needed only by a sensor; `save`: "samples" or "ends";
-    `prepared`: `prepare(mission)` if at hand (for batches that share times and law).
+    **Arguments:** `key`: a PRNG key, needed by a sensor or a disturbance that is random; `save`:
+    "samples" or "ends"; `prepared`: `prepare(mission)` if at hand (for batches that share times and
+    law).
 
     **Returns:** a Flight. `.result` is `diverged` where the state left finite numbers (the state is
     then held at its last finite value), `outside_horizon` where the law was asked past its nominal,
-    `end_not_reached` where a law that decides the end did not, `missed` where the end is off.
+    `end_not_reached` where a law that decides the end did not bring it about, `missed` where the
+    endpoint constraints are overstepped by more than `mission.miss`.
 
-    **Error:** fixed steps: fourth order in sample_interval / steps; Adaptive: its tolerance.
-    Differentiable in every leaf of the mission, the sample interval included (between the values
-    at which the number of samples jumps), and the lengths of samples given one by one.
+    **Error:** that of the integrator: fixed steps, fourth order in sample_interval / steps;
+    Adaptive, its tolerance. Differentiable in every leaf of the mission, the sample interval
+    included (between the values at which the number of samples jumps), and the lengths of samples
+    given one by one.
+
+    **Raises:** `ValueError` for another `save`, and without a key that is needed.
     """
     if save not in ("samples", "ends"):
         raise ValueError(f"save is {save!r}; choose 'samples' or 'ends'.")
-    if mission.sensor is not None and key is None:
-        raise ValueError("simulate: the mission has a sensor, which needs a PRNG key; pass key=.")
-    times, grid, laws = prepare(mission) if prepared is None else prepared
-    law, fixed = mission.law, isinstance(mission.integrator, RungeKutta4)
-    x0 = mission.initial_state
-
-    def ask(law_k: Law, carry: _Carry, k: Array, t: Array) -> tuple[Array, Command, Any, Any]:
-        x = jnp.stack(carry.x)
-        y, estimate = x, carry.estimate
-        if mission.sensor is not None:
-            y = mission.sensor(jax.random.fold_in(key, k), t, x)
-        if mission.estimator is not None:
-            y, estimate = mission.estimator(t, y, estimate)
-        command, memory = law_k(t, y, carry.memory)
-        return x, command, memory, estimate
-
-    def advance(
-        carry: _Carry,
-        asked: tuple[Array, Command, Any, Any],
-        is_last: Array,
-        t: Array,
-        t_next: Array,
-        stage_times: Array,
-        live: Array,
-    ) -> tuple[_Carry, Any]:
-        x, command, memory, estimate = asked
-        flown = mission.hold(command, t)
-        if fixed:
-            new = _fixed(mission, flown, command, is_last, t, t_next, stage_times, carry.x)
-        else:
-            new = _adaptive(mission, flown, command, is_last, t, t_next, x)
-        finite = jnp.isfinite(sum(new[1:], new[0]))  # one test: NaN and inf survive a sum
-        finite = finite & (carry.result != RESULTS.diverged)  # once diverged, held
-        new = tuple(jnp.where(finite, b, a) for a, b in zip(carry.x, new, strict=True))
-        result = RESULTS.where(carry.result == RESULTS.successful, command.result, carry.result)
-        result = RESULTS.where(finite, result, RESULTS.diverged)
-        saturated = carry.saturated + jnp.where(
-            live & command.saturated, jnp.ones((), x.dtype), jnp.zeros((), x.dtype)
-        )
-        out = (x, flown(t), flown.deviation(t)) if save == "samples" else None
-        keep = RESULTS.where(live, result, carry.result)
-        return _Carry(new, memory, estimate, saturated, keep), out
-
-    def sample(carry: _Carry, item: tuple) -> tuple[_Carry, Any]:
-        k, t, t_next, stage_times, law_k = item
-        asked = ask(law if law_k is None else law_k, carry, k, t)
-        is_last = k == mission.max_samples - 1
-        return advance(carry, asked, is_last, t, t_next, stage_times, t_next > t)
-
-    def sample_to_go(carry: tuple[_Carry, Clock], k: Array) -> tuple[tuple[_Carry, Clock], Any]:
-        flying, clock = carry
-        t = clock.t
-        asked = ask(law, flying, k, t)
-        clock = _advanced(mission, clock, asked[1].time_to_go)
-        stages = jnp.asarray(mission.integrator.stages or (0.0, 1.0), t.dtype)
-        within = t + (clock.t - t) * stages
-        flying, out = advance(flying, asked, clock.ending, t, clock.t, within, clock.t != t)
-        return (flying, clock), (out, t)
-
-    estimate = None if mission.estimator is None else mission.estimator.start(x0)
-    start = _Carry(
-        tuple(x0[i] for i in range(x0.shape[0])),
-        law.start(x0),
-        estimate,
-        jnp.zeros((), x0.dtype),
-        RESULTS.where(jnp.array(True), RESULTS.successful, RESULTS.successful),
-    )
-    count = jnp.arange(mission.max_samples)
-    # Checkpointed: reverse mode keeps the state at each sample and flies the sample again.
-    checkpoint = lambda f: jax.checkpoint(f, prevent_cse=False)  # pyright: ignore
-    if law.decides_end:
-        never = jnp.array(False)
-        begin = Clock(mission.initial_time, never, never)
-        (end, clock), (saved, when) = jax.lax.scan(checkpoint(sample_to_go), (start, begin), count)
-        late = ~clock.done & (end.result == RESULTS.successful)
-        result = RESULTS.where(late, RESULTS.end_not_reached, end.result)
-        end = eqx.tree_at(lambda e: e.result, end, result)
-        times = jnp.append(when, clock.t)
+    saved = save == "samples"
+    start = begin(mission, key)
+    if mission.law.decides_end:
+        end, out, times = _until_arrival(mission, key, start, saved)
     else:
-        items = (count, times[:-1], times[1:], grid.stages, laws)
-        end, saved = jax.lax.scan(checkpoint(sample), start, items)
-    final = jnp.stack(end.x)
+        known = prepare(mission) if prepared is None else prepared
+        times = known.times
+        end, out = _through_samples(mission, key, start, known, saved)
+    x0, final = mission.initial_state, jnp.stack(end.x)
     result = end.result
     if mission.miss is not None:
         arrived = result == RESULTS.successful
         missed = arrived & ~_arrived(mission, x0, final, times[-1])
         result = RESULTS.where(missed, RESULTS.missed, result)
-    if save == "samples":
-        xs, us, dus = saved
+    if saved:
+        xs, us, dus = out
         t, x = times, jnp.concatenate([xs, final[None]])
     else:
         t, x = jnp.stack([times[0], times[-1]]), jnp.stack([x0, final])
@@ -176,25 +114,81 @@ def simulate(
     return Flight(t, x, us, dus, final, times[-1], end.saturated, result)
 
 
+def _scan(step: Any, start: Any, items: Any) -> tuple[Any, Any]:
+    # Checkpointed: reverse mode keeps the state at each sample and flies the sample again.
+    return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), start, items)  # pyright: ignore
+
+
+def _through_samples(
+    mission: Mission, key: Any, start: Loop, prepared: Prepared, save: bool
+) -> tuple[Loop, Any]:
+    """The loop after all samples, whose times are known ahead."""
+
+    def sample(loop: Loop, item: tuple) -> tuple[Loop, Any]:
+        k, t, t_next, stages, law = item
+        law = mission.law if law is None else law
+        command, loop = asked(mission, law, key, loop, k, t)
+        span = Span(k, t, t_next, stages, k == mission.max_samples - 1)
+        return flown_across(mission, key, loop, command, span, save)
+
+    times, grid, laws = prepared
+    count = jnp.arange(mission.max_samples)
+    # The looked-up law keeps to the stages, and the flight with it.
+    stages = None if grid is None or laws is None else grid.stages
+    return _scan(sample, start, (count, times[:-1], times[1:], stages, laws))
+
+
 class Clock(eqx.Module):
-    """Of a flight whose end its law decides."""
+    """Of a flight whose end its law decides: the time, whether the sample under way is meant to be
+    the last, and whether the end was reached."""
 
     t: Float[Array, ""]
-    ending: Bool[Array, ""]  # this step is meant to be the last
+    ending: Bool[Array, ""]
     done: Bool[Array, ""]
 
 
-def _advanced(mission: Mission, clock: Clock, to_go: Array) -> Clock:
-    """One interval on, or as far as there is to go, until nothing is left; where the law finds
-    itself past its end, once back by that much (thesis, section 4.5).
+def _until_arrival(
+    mission: Mission, key: Any, start: Loop, save: bool
+) -> tuple[Loop, Any, Float[Array, " instant"]]:
+    """The loop at the end that the law decides, what was saved, and the times of the samples.
 
-    What counts as nothing is still flown: the end's derivatives are in it.
+    **Raises:** `ValueError` for a law whose commands know no time to go.
+    """
+
+    def sample(carry: tuple[Loop, Clock], k: Array) -> tuple[tuple[Loop, Clock], Any]:
+        loop, clock = carry
+        t = clock.t
+        command, loop = asked(mission, mission.law, key, loop, k, t)
+        if command.time_to_go is None:
+            raise ValueError(
+                f"{type(mission.law).__name__} decides the end of its flight, but the time_to_go "
+                f"of its {type(command).__name__} is None; give the time to go in the command."
+            )
+        clock = _advanced(mission, clock, command.time_to_go)
+        span = Span(k, t, clock.t, None, clock.ending)
+        loop, out = flown_across(mission, key, loop, command, span, save)
+        return (loop, clock), (out, t)
+
+    never = jnp.array(False)
+    clock = Clock(mission.initial_time, never, never)
+    (end, clock), (out, when) = _scan(sample, (start, clock), jnp.arange(mission.max_samples))
+    late = ~clock.done & (end.result == RESULTS.successful)
+    result = RESULTS.where(late, RESULTS.end_not_reached, end.result)
+    end = Loop(end.x, end.memories, end.saturated, result)
+    return end, out, jnp.append(when, clock.t)
+
+
+def _advanced(mission: Mission, clock: Clock, to_go: Array) -> Clock:
+    """The clock one interval further, or at the end if that is nearer. Where the law finds that the
+    end has passed, the clock goes back by that much, once (thesis, section 4.5).
+
+    A remainder that counts as no time to go is still flown: the end's derivatives are in it.
     """
     step = jnp.minimum(mission.sample_interval, to_go)
     step = jnp.minimum(step, mission.final_time - clock.t)
     step = jnp.where(clock.done, jnp.zeros_like(step), step).astype(clock.t.dtype)
     rounding = 8 * jnp.finfo(clock.t.dtype).eps * jnp.abs(mission.final_time)
-    near = jnp.maximum(END * mission.sample_interval, rounding)
+    near = jnp.maximum(_OVER * mission.sample_interval, rounding)
     arrived = clock.done | (to_go < near)
     return Clock(clock.t + step, to_go <= mission.sample_interval, arrived)
 
@@ -203,14 +197,13 @@ def _arrived(mission: Mission, x0: Array, xf: Array, tf: Array) -> Bool[Array, "
     """Whether the endpoint constraints hold to within `mission.miss`."""
     plant = mission.plant
     e = plant.endpoint_constraints(x0, xf, mission.initial_time, tf)
-    lo, hi = bounds_of(plant.endpoint_bounds, e.shape[0], e.dtype)
-    off = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
+    off = overstep(e, plant.endpoint_bounds)
     return jnp.all(off <= jnp.asarray(mission.miss, e.dtype))
 
 
 def sample_times(mission: Mission) -> Float[Array, " instant"]:
-    """min(t0 + k interval, tf) for k = 0 ... max_samples, or after each given length; the last is
-    tf."""
+    """Times (K+1,) of the samples and of the end: min(t0 + k interval, tf) for k = 0 ...
+    max_samples, or the sums of the given lengths; the last is tf."""
     if mission.sample_interval.ndim:
         passed = jnp.pad(jnp.cumsum(mission.sample_interval), (1, 0))
     else:
@@ -218,57 +211,3 @@ def sample_times(mission: Mission) -> Float[Array, " instant"]:
         passed = mission.sample_interval * count
     times = mission.initial_time + passed
     return jnp.minimum(times, mission.final_time).at[-1].set(mission.final_time)
-
-
-def _fixed(
-    mission: Mission,
-    flown: Command,
-    command: Command,
-    is_last: Bool[Array, ""],
-    t: Array,
-    t_next: Array,
-    stage_times: Array,
-    x: tuple[Array, ...],
-) -> tuple[Array, ...]:
-    nominal, deviation = flown.nominal_on(stage_times), flown.deviation_on(stage_times)
-    if mission.last is not None:
-        other = mission.last(command, t)
-        choose = lambda a, b: jax.tree_util.tree_map(lambda a, b: jnp.where(is_last, a, b), a, b)
-        full = lambda d: d * (stage_times.shape[0] if len(d) == 1 else 1)
-        nominal = choose(other.nominal_on(stage_times), nominal)
-        deviation = choose(full(other.deviation_on(stage_times)), full(deviation))
-    plant, disturbance = mission.plant, mission.disturbance
-
-    def rate(t: Any, x: Array, u: Array) -> Array:
-        dx = plant.dynamics(t, x, u)
-        return dx if disturbance is None else dx + disturbance(t, x)
-
-    assert isinstance(mission.integrator, RungeKutta4)
-    return mission.integrator.across(stacked(rate), t, t_next - t, x, nominal, deviation)
-
-
-def _adaptive(
-    mission: Mission,
-    flown: Command,
-    command: Command,
-    is_last: Bool[Array, ""],
-    t: Array,
-    t_next: Array,
-    x: Array,
-) -> tuple[Array, ...]:
-    plant, disturbance = mission.plant, mission.disturbance
-    last = mission.last(command, t) if mission.last is not None else None
-
-    def rate(t: Any, x: Array) -> Array:
-        u = flown(t) if last is None else jnp.where(is_last, last(t), flown(t))
-        dx = plant.dynamics(t, x, u)
-        return dx if disturbance is None else dx + disturbance(t, x)
-
-    assert isinstance(mission.integrator, Adaptive)
-    # A sample beyond the end has no length, which an adaptive solver does not take.
-    width = jnp.where(t_next != t, t_next - t, 1.0)
-    final, result = mission.integrator.across(rate, t, t + width, x)
-    good = (result == RESULTS.successful) & jnp.all(jnp.isfinite(final))
-    final = jnp.where(good, final, jnp.nan)
-    final = jnp.where(t_next != t, final, x)
-    return tuple(final[i] for i in range(final.shape[0]))

@@ -1,60 +1,63 @@
-"""What is flown of a command until the next sample."""
+"""Holds: the part of a law's command that is flown until the next sample."""
 
-import abc
 from typing import Any, ClassVar
 
-import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.lanes import Lanes, lanes
-from jaxguide.laws.law import Command
+from jaxguide.laws.lanes import Lanes, StagedCommand, StagedHold, lanes, staged
+from jaxguide.laws.law import Command, Hold
+from jaxguide.laws.plain import Plain
 from jaxguide.types import RESULTS
 
 
-class Hold(eqx.Module):
-    """Turns a law's command into what the vehicle does over the sample that begins at `t_k`."""
-
-    uses_history: ClassVar[bool] = False  # whether the command's deviation is asked after t_k
-
-    @abc.abstractmethod
-    def __call__(self, command: Command, t_k: Any) -> Command:
-        """The command as flown."""
-
-
-class History(Hold):
-    """The law's own open-loop history of the deviation (2002 paper, eq. 49)."""
+class History(StagedHold):
+    """Flies the whole command: the law's own open-loop history of the deviation (2002 paper,
+    eq. (49))."""
 
     uses_history: ClassVar[bool] = True
 
-    def __call__(self, command: Command, t_k: Any) -> Command:
-        return command
+    def start(self) -> None:
+        return None
+
+    def __call__(self, command: Command, t_k: Any, memory: None) -> tuple[Command, None]:
+        return command, None
 
 
-class HoldDeviation(Hold):
+class HoldDeviation(StagedHold):
     """Zero-order hold of the deviation: u = u*(t) + du(t_k)."""
 
-    def __call__(self, command: Command, t_k: Any) -> Command:
-        return _HeldDeviation(
+    def start(self) -> None:
+        return None
+
+    def __call__(self, command: Command, t_k: Any, memory: None) -> tuple["HeldDeviation", None]:
+        held = HeldDeviation(
             command=command,
             du=command.deviation(t_k),
             result=command.result,
             saturated=command.saturated,
         )
+        return held, None
 
 
-class HoldControl(Hold):
+class HoldControl(StagedHold):
     """Zero-order hold of the whole control: u = u*(t_k) + du(t_k)."""
 
-    def __call__(self, command: Command, t_k: Any) -> Command:
-        return _HeldControl(
+    def start(self) -> None:
+        return None
+
+    def __call__(self, command: Command, t_k: Any, memory: None) -> tuple["HeldControl", None]:
+        held = HeldControl(
             u=command.nominal(t_k),
             du=command.deviation(t_k),
             result=command.result,
             saturated=command.saturated,
         )
+        return held, None
 
 
-class _HeldDeviation(Command):
+class HeldDeviation(StagedCommand):
+    """The nominal of `command` and the deviation `du`, constant over the sample."""
+
     command: Command
     du: Float[Array, " m"]
     result: RESULTS
@@ -66,14 +69,16 @@ class _HeldDeviation(Command):
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self.du
 
-    def nominal_on(self, times: Array) -> tuple[Lanes, ...]:
-        return self.command.nominal_on(times)
+    def nominal_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
+        return staged(self.command).nominal_on(times)
 
-    def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
+    def deviation_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
         return (lanes(self.du),)
 
 
-class _HeldControl(Command):
+class HeldControl(StagedCommand):
+    """The nominal `u` and the deviation `du`, both constant over the sample."""
+
     u: Float[Array, " m"]
     du: Float[Array, " m"]
     result: RESULTS
@@ -85,5 +90,18 @@ class _HeldControl(Command):
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self.du
 
-    def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
+    def nominal_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
+        return (lanes(self.u),) * times.shape[0]
+
+    def deviation_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
         return (lanes(self.du),)
+
+
+class PlainHold(Plain, Hold):
+    """A function `hold(command, t_k) -> Command` as a Hold."""
+
+    def start(self) -> None:
+        return None
+
+    def __call__(self, command: Command, t_k: Any, memory: None) -> tuple[Command, None]:
+        return self.function(command, t_k), None

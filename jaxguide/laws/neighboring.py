@@ -1,4 +1,4 @@
-"""Neighbouring optimal control: du = K dx, sampled (2002 paper, eq. 49 and section 4)."""
+"""Neighbouring optimal control: du = K dx, sampled (2002 paper, eq. (49) and section 4)."""
 
 from typing import Any
 
@@ -8,20 +8,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.lanes import Lanes, SampleGrid, lanes
+from jaxguide.laws.lanes import GridLaw, Lanes, SampleGrid, StagedCommand, lanes
 from jaxguide.laws.law import Command, Law
 from jaxguide.neighboring.gains import GainSchedule
 from jaxguide.types import RESULTS, is_traced
 
 
-class NeighboringOptimal(Law):
-    """u = u*(t) + du(t), du from the deviation dx = x - x*(t_k) measured at the sample.
+class NeighboringOptimal(GridLaw):
+    """u = u*(t) + du(t), with du from the deviation dx = x - x*(t_k) measured at the sample.
 
-    The command carries the whole open-loop history du(t) of eq. (49) up to the final time; a hold
-    decides how much of it is flown.
+    The command carries the whole open-loop history du(t) of the 2002 paper, eq. (49), up to the
+    final time; a hold decides how much of it is flown.
 
-    **Arguments:** `schedule`: gains; `cap`: bound on |du| per control (inf: none); `scale`: a
-    factor on every gain.
+    **Arguments:**
+
+    - `schedule`: the gains, from `jg.gain_schedule`.
+    - `cap`: bound on |du|, for each control or one for all, in their units (inf: none). A command
+      that it limits is `saturated`.
+    - `scale`: a factor on every gain.
+
+    **Error:** that of the schedule's gains. A command asked for outside the nominal's horizon has
+    the result `outside_horizon`.
+
+    **Raises:** `ValueError` for a cap that is not positive.
     """
 
     schedule: GainSchedule
@@ -51,14 +60,15 @@ class NeighboringOptimal(Law):
         ), None
 
     def _gain(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
-        """du(t) per dx(t_k); outside the schedule's times its first or last gain is held."""
+        """du(t) per dx(t_k). Before the schedule's first time and after its last, the gain of that
+        time is used."""
         known = jnp.clip(t_k, self.schedule.times[0], self.schedule.times[-1])
         return self.scale * self.schedule.history(known, jnp.where(known == t_k, t, known))
 
     def prepared(self, grid: SampleGrid, histories: bool) -> "PreparedNeighboring":
         extremal = self.schedule.extremal
-        own = lambda a: a.astype(extremal.t.dtype)
-        grid_times, stages = own(grid.times), own(grid.stages)
+        as_gains = lambda a: a.astype(extremal.t.dtype)
+        grid_times, stages = as_gains(grid.times), as_gains(grid.stages)
         K = jax.vmap(self.schedule)(grid_times)
         maps = None
         # One `vmap` over all stages: two, nested, take twice as long to trace.
@@ -80,7 +90,7 @@ class NeighboringOptimal(Law):
 
 
 class NeighboringCommand(Command):
-    """The history du(t) = K(t; t_k) dx, capped."""
+    """The nominal control and the history du(t) = K(t; t_k) dx, limited to the law's cap."""
 
     law: NeighboringOptimal
     t_k: Float[Array, ""]
@@ -97,8 +107,12 @@ class NeighboringCommand(Command):
 
 
 class PreparedNeighboring(Law):
-    """One sample of `NeighboringOptimal`, its gains looked up; leaves gain a sample axis when
-    stacked by `prepared`."""
+    """`NeighboringOptimal` with its gains looked up: of all samples (a leading axis k on every
+    leaf, as `prepared` gives it), or of one, which can be called.
+
+    `maps`: du at each stage per dx at the sample; None where only the sample's own is flown.
+    `inside`: whether the sample lies within the nominal's horizon.
+    """
 
     x_nominal: Float[Array, "*k n"]
     K: Float[Array, "*k m n"]
@@ -107,7 +121,7 @@ class PreparedNeighboring(Law):
     cap: Float[Array, "*k"]
     inside: Bool[Array, "*k"]
 
-    def start(self, x0: Array) -> None:
+    def start(self, x0: Float[Array, " n"]) -> None:
         return None
 
     def __call__(
@@ -117,30 +131,46 @@ class PreparedNeighboring(Law):
         du = _product(self.K, dx)
         du, saturated = _capped(du, self.cap)
         result = RESULTS.where(self.inside, RESULTS.successful, RESULTS.outside_horizon)
-        return PreparedCommand(
-            law=self, dx=jnp.stack(dx), at_sample=du, result=result, saturated=saturated
-        ), None
+        command = PreparedCommand(
+            law=self, t_k=t_k, dx=jnp.stack(dx), at_sample=du, result=result, saturated=saturated
+        )
+        return command, None
 
 
-class PreparedCommand(Command):
-    """As NeighboringCommand, at the stage times it was prepared for."""
+class PreparedCommand(StagedCommand):
+    """A NeighboringCommand that is known at its sample and at the stages alone.
+
+    **Raises:** `ValueError` from `nominal` and `deviation` at any other time than the very `t_k`
+    with which the law was called: its value there is not known.
+    """
 
     law: PreparedNeighboring
+    t_k: Any
     dx: Float[Array, " n"]
     at_sample: Float[Array, " m"]
     result: RESULTS
     saturated: Bool[Array, ""]
 
     def nominal(self, t: Any) -> Float[Array, " m"]:
+        self._require_sample(t)
         return self.law.u_nominal[0]
 
     def deviation(self, t: Any) -> Float[Array, " m"]:
+        self._require_sample(t)
         return self.at_sample
 
-    def nominal_on(self, times: Array) -> tuple[Lanes, ...]:
+    def _require_sample(self, t: Any) -> None:
+        if t is not self.t_k:  # one object: under a trace, times cannot be compared
+            raise ValueError(
+                "A command prepared for a fast flight was asked for its control at another time "
+                "than its sample. Derive what asks (a hold, say) from jg.Hold itself: it is then "
+                "given the law's own command."
+            )
+
+    def nominal_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
         return tuple(lanes(self.law.u_nominal[j]) for j in range(times.shape[0]))
 
-    def deviation_on(self, times: Array) -> tuple[Lanes, ...]:
+    def deviation_on(self, times: Float[Array, " stage"]) -> tuple[Lanes, ...]:
         maps = self.law.maps
         assert maps is not None
         at = lambda j: _capped(_product(maps[j], lanes(self.dx)), self.law.cap)[0]
@@ -148,12 +178,13 @@ class PreparedCommand(Command):
 
 
 def _product(K: Float[Array, "m n"], dx: Lanes) -> Float[Array, " m"]:
-    """K dx by multiplications and additions: under `vmap` a dot over n lanes is slower."""
+    """K dx by multiplications and additions: under `vmap` a dot product of n entries is slower."""
     rows = [sum(K[j, i] * dx[i] for i in range(len(dx))) for j in range(K.shape[0])]
     return jnp.stack(rows)
 
 
 def _capped(du: Array, cap: Any) -> tuple[Array, Bool[Array, ""]]:
+    """`du` limited to `cap` in each control, and whether that changed it."""
     cap = jnp.asarray(cap, du.dtype)
     limited = jnp.clip(du, -cap, cap)
     return limited, jnp.any(jnp.abs(du) > cap)

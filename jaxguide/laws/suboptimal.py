@@ -9,19 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.laws.gain_interpolation import Gains, Interpolation, LinearGains
+from jaxguide.laws.gain_interpolation import Interpolation, LinearGains, StationGains
 from jaxguide.laws.law import Command, Law
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
 from jaxguide.problem import is_free
 from jaxguide.types import RESULTS, is_traced
 
-_ITERATIONS = 5  # of the search; Newton doubles the digits of a guess good to a few percent
-_FOUND = 1e-9  # of the horizon: the last step of a search that converged
+# Newton's steps in the search for the reference time. Each doubles the digits of a guess that is
+# good to a few percent: five are enough for rounding.
+_ITERATIONS = 5
+# A search has converged if its last step is below this fraction of the horizon: Newton's next one
+# would be of order its square, far below rounding.
+_FOUND = 1e-9
 
 
 class Plan(eqx.Module):
-    """What a law has in mind: the nominal's clock runs `offset` behind the flight's, and the
-    correction is `du` at the flight's time `since`, changing at `slope`."""
+    """The control from a sample on: u = u*(t - offset) + du + slope (t - since).
+
+    `offset` (): time by which the nominal's clock runs behind the flight's; `since` (): flight time
+    at which the correction is `du` (m,); `slope` (m,): its rate.
+    """
 
     offset: Float[Array, ""]
     since: Float[Array, ""]
@@ -30,12 +37,16 @@ class Plan(eqx.Module):
 
 
 class SuboptimalCommand(Command):
-    """Nominal and correction, each piecewise linear in time."""
+    """Nominal and correction, each piecewise linear in time.
+
+    `left` (): time to go, of a law that decides the end.
+    """
 
     schedule: SuboptimalSchedule
     plan: Plan
     result: RESULTS
     saturated: Bool[Array, ""]
+    left: Float[Array, ""] | None = None
 
     def nominal(self, t: Any) -> Float[Array, " m"]:
         schedule = self.schedule
@@ -45,35 +56,32 @@ class SuboptimalCommand(Command):
     def deviation(self, t: Any) -> Float[Array, " m"]:
         return self.plan.du + self.plan.slope * (t - self.plan.since)
 
-
-class TimedCommand(SuboptimalCommand):
-    """Also knows how long the flight has to go."""
-
-    left: Float[Array, ""]
-
     @property
-    def time_to_go(self) -> Float[Array, ""]:
+    def time_to_go(self) -> Float[Array, ""] | None:
         return self.left
 
 
 def _planned(
-    schedule: SuboptimalSchedule, gains: Gains, offset: Array, since: Array, dx: Array
+    schedule: SuboptimalSchedule, gains: StationGains, offset: Array, since: Array, dx: Array
 ) -> Plan:
-    """Eqs (4.39)-(4.43): from the change here to that at the next node, in a straight line."""
+    """A correction that goes in a straight line from the change here to that at the next node
+    (thesis, eqs (4.39)-(4.43))."""
     du, ahead = gains.here.astype(dx.dtype) @ dx, gains.ahead.astype(dx.dtype) @ dx
     slope = (ahead - du) / (gains.spacing * schedule.duration).astype(dx.dtype)
     return Plan(offset, since, du, slope)
 
 
 def _choose(first: Array, a: Plan, b: Plan) -> Plan:
+    """`a` where `first`, else `b`."""
     return jax.tree_util.tree_map(lambda a, b: jnp.where(first, a, b), a, b)
 
 
 class NeighboringSuboptimal(Law):
-    """u = u*(t) + du(t), du from the deviation at the sample, with the clock as reference.
+    """u = u*(t) + du(t), with du from the deviation of the state from the nominal at the same time.
 
-    For a nominal whose independent variable ends where it should: a fixed final time, or a state
-    (`jg.StateAsTime`), as in Nowack's law, which holds the correction (`jg.HoldDeviation`).
+    For a nominal whose independent variable has a given end: a fixed final time, or a state in
+    place of time (`jg.StateAsTime`), as in Nowack's law, which holds the correction
+    (`jg.HoldDeviation`). Outside the nominal's horizon the result is `outside_horizon`.
 
     **Arguments:** `schedule`: from `jg.suboptimal_gains`; `interpolation`: `LinearGains()` or
     `TimeToGoGains(powers)`.
@@ -104,20 +112,24 @@ class NeighboringSuboptimal(Law):
 
 
 class TimeToGo(Law):
-    """u = u*(t0) + du, where t0 is the time on the nominal at which the time to go is that of the
-    state measured: there its change, K_time dx, vanishes. For a free final time, which the law
-    then decides: a flight lasts as long as its time to go.
+    """u = u*(t0) + du, where t0, the reference time, is the time on the nominal at which the time
+    to go equals that of the measured state: there its change, K_time dx, vanishes. For a free final
+    time, which the law decides: a flight lasts as long as its time to go.
 
     **Arguments:**
 
     - `schedule`, `interpolation`: as in `NeighboringSuboptimal`.
-    - `window`: how far from where the last one leads the reference time is looked for, in
-      fractions of the horizon. If none is found there the plan goes on, and the result says so.
-    - `quiet`: in the last so many units of time the correction is not updated, only the time to go:
-      its gains grow without bound, and what they would correct is no longer worth it. With 0 there
-      are none, not even past the end, where the search may lead.
+    - `window`: half the width of the interval in which the reference time is sought, as a fraction
+      of the horizon, about the time to which the last reference time leads. If there is none in it,
+      the command goes on as it was, with the result `no_reference_time`.
+    - `quiet`: length, in the plant's unit of time, of the last part of the flight, in which only
+      the time to go is updated and the correction goes on as it was: its gains grow without bound
+      there, and little is left to correct. With 0 there is no such part, not even past the end.
 
-    **Error:** the reference time to rounding; it is differentiated as the root it is.
+    **Error:** the reference time to rounding; its derivative is that of the root.
+
+    **Raises:** `ValueError` for a nominal whose final time is given, a window that is not positive,
+    or a negative `quiet`.
 
     **Source:** thesis, eqs (4.36)-(4.45).
     """
@@ -146,7 +158,9 @@ class TimeToGo(Law):
         none = jnp.zeros(self.schedule.controls.shape[1], x0.dtype)
         return Plan(zero, self.schedule.initial_time.astype(x0.dtype), none, none)
 
-    def __call__(self, t_k: Any, x: Float[Array, " n"], memory: Plan) -> tuple[TimedCommand, Plan]:
+    def __call__(
+        self, t_k: Any, x: Float[Array, " n"], memory: Plan
+    ) -> tuple[SuboptimalCommand, Plan]:
         schedule, t_k = self.schedule, jnp.asarray(t_k, x.dtype)
         begin, duration = (v.astype(x.dtype) for v in (schedule.initial_time, schedule.duration))
         guess = (t_k - memory.offset - begin) / duration
@@ -155,18 +169,23 @@ class TimeToGo(Law):
         dx = x - schedule.state(tau).astype(x.dtype)
         gains = self.interpolation(schedule, tau)
         fresh = _planned(schedule, gains, t_k - reference, t_k, dx)
-        left = begin + duration - reference  # after a search in vain, as the last one had it
+        left = begin + duration - reference  # if none was found, by the last reference time
         held = dataclasses.replace(memory, offset=fresh.offset)
         quiet = (left < self.quiet) & (self.quiet > 0)
         plan = _choose(found & ~quiet, fresh, _choose(found, held, memory))
         result = RESULTS.where(found, RESULTS.successful, RESULTS.no_reference_time)
-        command = TimedCommand(
+        command = SuboptimalCommand(
             schedule=schedule, plan=plan, result=result, saturated=jnp.array(False), left=left
         )
         return command, plan
 
+    def latest_end(self, initial_time: Any) -> Float[Array, ""]:
+        # Half as long again as the nominal: a flight that needs more is beyond neighbouring laws.
+        return initial_time + 1.5 * self.schedule.duration
+
     def _reference(self, x: Array, guess: Array) -> tuple[Array, Bool[Array, ""]]:
-        """Where on the nominal the time to go does not change, and whether it was found."""
+        """The fraction of the horizon at which the time to go does not change, and whether it was
+        found (`guess` if not)."""
 
         def change(tau: Array, law: "TimeToGo", x: Array) -> Array:
             gains = law.interpolation(law.schedule, tau)
@@ -180,8 +199,8 @@ class TimeToGo(Law):
         past = 1 + (1 - positions[-2]).astype(x.dtype) / 4
         low = jnp.asarray(middle - self.window, x.dtype)
         high = jnp.minimum(middle + self.window, past).astype(x.dtype)
-        # Beside an earlier nominal state the vehicle is ahead: the change rises through zero (page
-        # 28 of the thesis has it the other way round).
+        # Compared with an earlier nominal state the vehicle is ahead: the change rises through zero
+        # (page 28 of the thesis has the signs the other way round).
         bracketed = (value(low) < 0) & (value(high) > 0)
 
         def newton(carry: tuple, _: None) -> tuple[tuple, None]:
@@ -197,6 +216,6 @@ class TimeToGo(Law):
         settled = step <= jnp.maximum(_FOUND, 8 * jnp.finfo(x.dtype).eps)
         found = bracketed & settled
         tau = jax.lax.stop_gradient(jnp.where(found, tau, middle))
-        # One step of Newton more, for its derivatives: those of the root.
+        # One more step of Newton gives the derivatives of the root.
         steep = jax.lax.stop_gradient(jnp.where(found, both(tau)[1], 1.0))
         return jnp.where(found, tau - change(tau, self, x) / steep, guess), found

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import overstep
 from jaxguide.flight.mission import Mission
 
 
@@ -21,7 +21,7 @@ def miss_distance(mission: Mission, xf: Any, tf: Any) -> Float[Array, ""]:
     """Length of the part of `end_errors` that lies outside the endpoint bounds; 0 without any."""
     e = end_errors(mission, xf, tf)
     allowed = 1.0 if mission.miss is None else mission.miss
-    lo, hi = bounds_of(mission.plant.endpoint_bounds, e.shape[0], e.dtype)
     scale = jnp.broadcast_to(jnp.asarray(allowed, e.dtype), e.shape)
-    off = jnp.maximum(lo / scale - e, 0.0) + jnp.maximum(e - hi / scale, 0.0)
+    lower, upper = (jnp.asarray(bound, e.dtype) for bound in mission.plant.endpoint_bounds)
+    off = overstep(e, (lower / scale, upper / scale))
     return jnp.sqrt(jnp.sum(off**2))

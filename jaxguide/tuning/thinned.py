@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxguide.laws.gain_interpolation import Gains, Interpolation
+from jaxguide.laws.gain_interpolation import Interpolation, StationGains
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
 from jaxguide.tuning.relaxation import thinned_weights
 
@@ -20,7 +20,7 @@ class ThinnedGains(Interpolation):
     powers: Any
     present: Any
 
-    def __call__(self, schedule: SuboptimalSchedule, tau: Any) -> Gains:
+    def __call__(self, schedule: SuboptimalSchedule, tau: Any) -> StationGains:
         stations = schedule.stations
         powers = jnp.asarray(self.powers, stations.dtype)
         last = stations[-1]
@@ -35,7 +35,7 @@ class ThinnedGains(Interpolation):
         time = (1 - stations)[:, None] * schedule.K_time
         # The spacing to the node ahead is that of the schedule, not that of the stations kept.
         spacing = jnp.where(tau < last, w @ schedule.spacing, jnp.maximum(1 - tau, least))
-        return Gains(
+        return StationGains(
             jnp.tensordot(w, schedule.here * scale, 1) / now,
             jnp.tensordot(w, schedule.ahead * scale, 1) / now,
             on @ time,
