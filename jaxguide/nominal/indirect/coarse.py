@@ -37,7 +37,9 @@ def damped_newton(problem: Problem, z: Unknowns, steps: int) -> tuple[Unknowns, 
     **Returns:** the unknowns, their relative residual, and the objective.
 
     Each pass evaluates residual and Jacobian once, at a trial point; a trial that is worse is
-    retried with a shorter step. One evaluation in the loop keeps the program small.
+    retried with a shorter step. One evaluation in the loop keeps the program small. What is worse
+    is measured in the residual's sizes at the start: those of the trial itself would let it run to
+    where the Jacobian is large.
     """
     flat, unravel = jax.flatten_util.ravel_pytree(z)
 
@@ -59,24 +61,27 @@ def damped_newton(problem: Problem, z: Unknowns, steps: int) -> tuple[Unknowns, 
         return jax.flatten_util.ravel_pytree(z)[0]
 
     def body(carry: tuple) -> tuple:
-        v, dv, step, left, cost, k = carry
+        v, dv, step, best, left, cost, unit, k = carry
         trial = clipped(v + step * dv)
         jacobian, (r, trial_cost, size) = jax.jacfwd(residual, has_aux=True)(trial)
         of = jnp.abs(jacobian) @ size
-        relative = jnp.max(jnp.abs(r) / jnp.where(of > 0, of, 1.0))
-        relative = jnp.where(jnp.isfinite(relative), relative, jnp.inf)
-        better = relative < _RISE * left
+        of = jnp.where(of > 0, of, 1.0)
+        unit = jnp.where(k == 0, of, unit)
+        largest, relative = (jnp.max(jnp.abs(r) / by) for by in (unit, of))
+        largest = jnp.where(jnp.isfinite(largest), largest, jnp.inf)
+        better = largest < _RISE * best
         v = jnp.where(better, trial, v)
         dv = jnp.where(better, -gauss_solve(jacobian, r), dv)
         step = jnp.where(better, 1.0, _SHORTER * step)
+        best = jnp.where(better, largest, best)
         left = jnp.where(better, relative, left)
-        return v, dv, step, left, jnp.where(better, trial_cost, cost), k + 1
+        return v, dv, step, best, left, jnp.where(better, trial_cost, cost), unit, k + 1
 
     one = jnp.ones((), flat.dtype)
-    far = jnp.inf * one
-    start = (flat, jnp.zeros_like(flat), one, far, far, jnp.zeros((), jnp.int32))
-    going = lambda c: (c[3] > _SETTLED) & (c[2] > _SHORTEST) & (c[5] < _ITERATIONS)
-    v, _, _, left, cost, _ = jax.lax.while_loop(going, body, start)
+    far, none = jnp.inf * one, jnp.zeros_like(flat)
+    start = (flat, none, one, far, far, far, none, jnp.zeros((), jnp.int32))
+    going = lambda c: (c[4] > _SETTLED) & (c[2] > _SHORTEST) & (c[7] < _ITERATIONS)
+    v, _, _, _, left, cost, _, _ = jax.lax.while_loop(going, body, start)
     return unravel(v), left, cost
 
 
