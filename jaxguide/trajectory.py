@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import bounds_of, size_along
 from jaxguide.conditions.control import polish_control
 from jaxguide.conditions.sizes import Sizes, sizes_of
 from jaxguide.problem import Chosen, Problem
@@ -192,7 +192,8 @@ def _polished(extremal: Extremal, t: Array) -> Point:
         largest = extremal.largest(jnp.abs(held), t)
         h_u = jax.jacfwd(problem.path_constraints, argnums=2)(t, x, u)
         force = largest[: len(u)] + largest[len(u) :] @ jnp.abs(h_u)
-    polished = polish_control(problem, t, x, u, costate, integral, force)
+    size = size_along(extremal.u, problem.control_bounds)  # the same at all times
+    polished = polish_control(problem, t, x, u, costate, integral, force, size)
     if extremal.u_before is not None:
         polished = jnp.clip(polished, *bounds_of(problem.control_bounds, len(u), u.dtype))
     return Point(x, polished, costate)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import largest_bound, positive
+from jaxguide.bounds import largest_bound, positive, size_along
 from jaxguide.problem import Problem
 
 # A state below this share of what the others would move it by is at rest: its size is `_MOVED` of
@@ -45,10 +45,7 @@ def sizes_of(
     `integral`: the multipliers of the integral constraints.
     """
     horizon = t[-1] - t[0]
-    u_size = jnp.max(jnp.abs(u), axis=0)
-    u_size = positive(
-        jnp.where(u_size > 0, u_size, largest_bound(problem.control_bounds, problem.m))
-    )
+    u_size = size_along(u, problem.control_bounds)
     x_size = state_sizes(problem, t, x, u)
     z = jnp.concatenate([x_size, u_size])
     along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import touches
 from jaxguide.linalg import solve
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.linearization import refuse_integrals, terminal_conditions
@@ -255,21 +255,24 @@ def _segmented(
     )
 
 
+# Part of a quantity's size along the extremal: how near a bound counts as on it. What a barrier of
+# 1e-9 leaves between an active bound and the solution is far below.
+_ON_BOUND = 1e-6
+
+
 def _bound_active(
     extremal: Extremal, times: Array, u: Float[Array, "time m"]
 ) -> Bool[Array, " time"]:
     """Where control, state or path constraints sit on a bound: a linear law is one-sided there."""
-    problem, dtype = extremal.problem, u.dtype
+    problem, size = extremal.problem, extremal.sizes()
     x = jax.vmap(extremal.point)(times).x
-
-    def touches(values: Float[Array, "time k"], bounds: Any) -> Bool[Array, " time"]:
-        lo, hi = bounds_of(bounds, values.shape[1], dtype)
-        room = 1e-6 * (1 + jnp.abs(values))
-        return jnp.any((values <= lo[None] + room) | (values >= hi[None] - room), axis=1)
-
     path = jax.vmap(problem.path_constraints)(times, x, u)
-    on_states = touches(x, problem.state_bounds)
-    return touches(u, problem.control_bounds) | on_states | touches(path, problem.path_bounds)
+    on_any = lambda values, bounds, size: jnp.any(touches(values, bounds, _ON_BOUND * size), axis=1)
+    return (
+        on_any(u, problem.control_bounds, size.u)
+        | on_any(x, problem.state_bounds, size.x)
+        | on_any(path, problem.path_bounds, size.path)
+    )
 
 
 @eqx.filter_jit
