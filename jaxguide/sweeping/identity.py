@@ -1,6 +1,7 @@
 """What a sweep's bits depend on, as digests by name: two sweeps of one identity give the same bits
 on machines of one kind. Host only."""
 
+import dataclasses
 import functools
 import hashlib
 import inspect
@@ -51,9 +52,9 @@ def about(order: Order) -> dict[str, Any]:
     """For people: what was flown, and by what it was dispersed."""
     plant = order.mission.plant
     numbers = {
-        name: np.asarray(value).tolist()
-        for name in plant.__dataclass_fields__
-        if eqx.is_array_like(value := getattr(plant, name)) and np.ndim(value) < 2
+        field.name: np.asarray(value).tolist()
+        for field in dataclasses.fields(plant)
+        if eqx.is_array_like(value := getattr(plant, field.name)) and np.ndim(value) < 2
     }
     control = [str(name) for name in plant.control_names]
     return {
@@ -79,11 +80,11 @@ def digest(tree: Any) -> str:
             sha.update(_source(leaf).encode())
     for node in _nodes(tree):
         sha.update(_source(type(node)).encode())
-        for name, field in getattr(node, "__dataclass_fields__", {}).items():
+        for field in dataclasses.fields(node):
             if field.metadata.get("static", False):
-                value = getattr(node, name)
+                value = getattr(node, field.name)
                 told = _source(value) if callable(value) else repr(value)
-                sha.update(f"{name}={told}".encode())
+                sha.update(f"{field.name}={told}".encode())
     return sha.hexdigest()[:16]
 
 
@@ -92,7 +93,7 @@ def _nodes(tree: Any) -> list[Any]:
     if isinstance(tree, eqx.Module):
         return [
             tree,
-            *(n for name in tree.__dataclass_fields__ for n in _nodes(getattr(tree, name))),
+            *(n for f in dataclasses.fields(tree) for n in _nodes(getattr(tree, f.name))),
         ]
     if isinstance(tree, (tuple, list)):
         return [n for item in tree for n in _nodes(item)]

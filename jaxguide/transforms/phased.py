@@ -23,7 +23,7 @@ from jaxguide.problem import (
     start_value,
 )
 from jaxguide.trajectory import Extremal, Multipliers
-from jaxguide.transforms.wrapped import FIELDS, Wrapped, own_fields
+from jaxguide.transforms.wrapped import Wrapped, own_fields, restated
 from jaxguide.types import is_traced
 
 
@@ -244,9 +244,7 @@ class Phased(Problem):
                 per_control(m.control)[i] / span, integral[i],
             )  # fmt: skip
             x, costate = per_state(extremal.x)[i], per_state(extremal.costate)[i]
-            phase = dataclasses.replace(
-                phase, initial_time=t0, final_time=tf, initial_state=tuple(x[0])
-            )
+            phase = restated(phase, initial_time=t0, final_time=tf, initial_state=tuple(x[0]))
             if i + 1 < len(problem.phases):
                 # What follows pulls at its end as much as if its state were given there.
                 pull = jax.grad(phase.endpoint_cost, argnums=1)(x[0], x[-1], t0, tf)
@@ -283,8 +281,3 @@ def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
 
 def _said(time: Any) -> str:
     return f"[{time.lo}, {time.hi}]" if is_free(time) else str(time)
-
-
-# What follows from the phases is no field: dataclasses.replace may not set it.
-for _name in FIELDS:
-    del Phased.__dataclass_fields__[_name]

@@ -1,5 +1,6 @@
-"""A Problem around another: what every transformation of a Problem shares."""
+"""A Problem around another: the frame of every transformation of a Problem."""
 
+import dataclasses
 from typing import Any
 
 from jaxguide.problem import Problem
@@ -32,12 +33,21 @@ class Wrapped(Problem):
         return self.inner.endpoint_constraints(x0, xf, t0, tf)
 
 
-FIELDS = (
+BOUNDARY_DATA = (
     "state_names", "control_names", "initial_time", "final_time", "initial_state", "state_bounds",
     "control_bounds", "endpoint_bounds", "path_bounds", "integral_bounds",
 )  # fmt: skip
 
 
 def own_fields(problem: Problem, **changed: Any) -> dict[str, Any]:
-    """The fields of a Problem around `problem`: its own, but for those `changed`."""
-    return {name: getattr(problem, name) for name in FIELDS} | changed
+    """The fields of a Problem around `problem`: its names and boundary data, and `changed` in
+    place of those it names."""
+    return {name: getattr(problem, name) for name in BOUNDARY_DATA} | changed
+
+
+def restated(problem: Problem, **changed: Any) -> Problem:
+    """`problem` with other boundary data: `changed` replaces fields; where one of them is a
+    property of `problem`, a `Wrapped` stands around it."""
+    if changed.keys() <= {f.name for f in dataclasses.fields(problem)}:
+        return dataclasses.replace(problem, **changed)
+    return Wrapped(inner=problem, **own_fields(problem, **changed))
