@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.linalg import cholesky_positive, solve
-from jaxguide.neighboring.segmented import Sweep
+from jaxguide.neighboring.sweep import Sweep
 
 
 def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
