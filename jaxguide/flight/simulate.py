@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import overstep
 from jaxguide.flight.integrators import Adaptive, RungeKutta4, stacked
 from jaxguide.flight.mission import Mission
 from jaxguide.laws.lanes import SampleGrid
@@ -203,8 +203,7 @@ def _arrived(mission: Mission, x0: Array, xf: Array, tf: Array) -> Bool[Array, "
     """Whether the endpoint constraints hold to within `mission.miss`."""
     plant = mission.plant
     e = plant.endpoint_constraints(x0, xf, mission.initial_time, tf)
-    lo, hi = bounds_of(plant.endpoint_bounds, e.shape[0], e.dtype)
-    off = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
+    off = overstep(e, plant.endpoint_bounds)
     return jnp.all(off <= jnp.asarray(mission.miss, e.dtype))
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import bounds_of, overstep
 from jaxguide.flight.mission import Mission
 
 
@@ -23,5 +23,5 @@ def miss_distance(mission: Mission, xf: Any, tf: Any) -> Float[Array, ""]:
     allowed = 1.0 if mission.miss is None else mission.miss
     lo, hi = bounds_of(mission.plant.endpoint_bounds, e.shape[0], e.dtype)
     scale = jnp.broadcast_to(jnp.asarray(allowed, e.dtype), e.shape)
-    off = jnp.maximum(lo / scale - e, 0.0) + jnp.maximum(e - hi / scale, 0.0)
+    off = overstep(e, (lo / scale, hi / scale))
     return jnp.sqrt(jnp.sum(off**2))

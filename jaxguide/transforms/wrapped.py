@@ -7,9 +7,19 @@ from jaxguide.problem import Problem
 
 
 class Wrapped(Problem):
-    """`inner` as it is, but for what a subclass changes."""
+    """The Problem `inner`, with the methods that a subclass writes in place of its own.
+
+    Names and boundary data are fields of the frame itself: see `own_fields`.
+    """
 
     inner: Problem
+
+    def around(self, problem: Problem) -> Problem:
+        """The same transformation of `problem`, in place of the user's Problem within.
+
+        Here `problem` itself: a Wrapped that cannot be built again counts as the user's Problem.
+        """
+        return problem
 
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
         return tuple(("inner", *path) for path in self.inner.parameter_paths())
@@ -43,6 +53,11 @@ def own_fields(problem: Problem, **changed: Any) -> dict[str, Any]:
     """The fields of a Problem around `problem`: its names and boundary data, and `changed` in
     place of those it names."""
     return {name: getattr(problem, name) for name in BOUNDARY_DATA} | changed
+
+
+def rewrapped(whole: Problem, problem: Problem) -> Problem:
+    """`problem` in the frames that stand around the user's Problem within `whole`."""
+    return whole.around(problem) if isinstance(whole, Wrapped) else problem
 
 
 def restated(problem: Problem, **changed: Any) -> Problem:

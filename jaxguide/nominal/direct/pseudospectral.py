@@ -31,7 +31,8 @@ from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import Endless
 from jaxguide.transforms.integrals import with_integrals
-from jaxguide.transforms.relaxed import relaxed, rewrapped
+from jaxguide.transforms.relaxed import relaxed
+from jaxguide.transforms.wrapped import rewrapped
 from jaxguide.types import RESULTS, is_traced
 
 _MOST_NODES = 512
