@@ -25,7 +25,7 @@ class Point(NamedTuple):
 
 
 class Multipliers(eqx.Module):
-    """Covectors of an extremal: <= 0 at lower, >= 0 at upper bounds."""
+    """Multipliers of an extremal's constraints: <= 0 at lower, >= 0 at upper bounds."""
 
     endpoint: Float[Array, " q"]
     path: Float[Array, "node p"]
@@ -65,7 +65,7 @@ class Trajectory(eqx.Module):
         return values[index]
 
     def interpolate(self, values: Float[Array, "node *k"], t: Any) -> Array:
-        """`values` at the nodes, interpolated at the scalar `t`; held beyond the ends."""
+        """The polynomial through the nodal `values` at the scalar `t`; held beyond the ends."""
         p = self.reference_nodes.shape[0]
         return self._at(lambda s: jax.lax.dynamic_slice_in_dim(values, s * (p - 1), p), t)
 
@@ -91,7 +91,7 @@ class Trajectory(eqx.Module):
         return interpolate(self.reference_nodes, pick(s), tau)
 
     def clock(self, t: Array) -> Array:
-        """What the polynomials are in, at the times `t`."""
+        """The variable of the polynomials at the times `t`: t, or s on an infinite horizon."""
         if self.stretch is None:
             return t
         since = t - self.t[0]

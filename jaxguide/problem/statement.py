@@ -30,6 +30,7 @@ class Free(eqx.Module):
 
 
 def is_free(x: object) -> bool:
+    """Whether `x` is for the solver to choose."""
     return isinstance(x, Free)
 
 
@@ -125,10 +126,10 @@ class Problem(eqx.Module):
         return None
 
     def check_statement(self) -> None:
-        """Refuses, with a `ValueError`, what a kind of Problem knows to be badly stated."""
+        """For kinds of Problems with rules of their own: raises `ValueError` if one is broken."""
 
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
-        """Where a `Free` static parameter is held, for the solver to choose."""
+        """Attributes and indices that lead to each `Free` static parameter."""
         return tuple(
             (f.name,)
             for f in dataclasses.fields(self)
@@ -179,7 +180,8 @@ def with_array_leaves(problem: Problem) -> Problem:
 
 
 def start_value(entry: Any) -> Any:
-    """A number, or the point from which a `Free` one is sought: guess, middle, or nearest to 0."""
+    """`entry` if it is a number. Of a `Free` one the point from which a search starts: its guess,
+    otherwise the middle of finite limits, otherwise the admissible number closest to 0."""
     if not is_free(entry):
         return entry
     if entry.guess is not None:
