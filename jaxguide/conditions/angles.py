@@ -1,12 +1,11 @@
 """Controls that are angles, recognised by the Problem's periodicity: jumps of 2 pi removed."""
 
-import jax.flatten_util
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.problem import Problem
-
 
 # Relative to the largest rate along the nodes: what a quarter turn must change at least, and what a
 # whole turn may at most (rounding of sine and cosine leaves 1e-15).

@@ -71,9 +71,9 @@ def solve_sweeps(
     M = jnp.concatenate([c.M * ratio[None], c.b / scale[None, :, None]], axis=2)
     first, both = counts[0] * segments, sum(counts) * segments
     by_node = lambda a, s: a.reshape(s, segments, scale.shape[0], -1).transpose(0, 2, 3, 1)
-    systems = by_node(M[:first], counts[0]), by_node(M[first:both], counts[1])
+    coarse, fine = by_node(M[:first], counts[0]), by_node(M[first:both], counts[1])
 
-    slopes, begins = _transitions(*systems, breaks, *grids, sweeps)
+    slopes, begins = _transitions(coarse, fine, breaks, grids[0], grids[1], sweeps)
     ends = _joined(extremal, terminal, scale, begins)
     finer_nodes = jnp.asarray(nodes_lg(counts[1])[0], breaks.dtype)
     pair = [
