@@ -50,6 +50,7 @@ class Trajectory(eqx.Module):
 
     @property
     def breaks(self) -> Float[Array, " edge"]:
+        """Times at which the segments begin, and the end of the last."""
         return self.t[:: self.reference_nodes.shape[0] - 1]
 
     @property
