@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import bounds_of, size_along
 from jaxguide.conditions.control import polish_control
 from jaxguide.conditions.sizes import Sizes, sizes_of
 from jaxguide.problem import Chosen, Problem
@@ -25,7 +25,7 @@ class Point(NamedTuple):
 
 
 class Multipliers(eqx.Module):
-    """Covectors of an extremal: <= 0 at lower, >= 0 at upper bounds."""
+    """Multipliers of an extremal's constraints: <= 0 at lower, >= 0 at upper bounds."""
 
     endpoint: Float[Array, " q"]
     path: Float[Array, "node p"]
@@ -50,6 +50,7 @@ class Trajectory(eqx.Module):
 
     @property
     def breaks(self) -> Float[Array, " edge"]:
+        """Times at which the segments begin, and the end of the last."""
         return self.t[:: self.reference_nodes.shape[0] - 1]
 
     @property
@@ -65,7 +66,7 @@ class Trajectory(eqx.Module):
         return values[index]
 
     def interpolate(self, values: Float[Array, "node *k"], t: Any) -> Array:
-        """`values` at the nodes, interpolated at the scalar `t`; held beyond the ends."""
+        """The polynomial through the nodal `values` at the scalar `t`; held beyond the ends."""
         p = self.reference_nodes.shape[0]
         return self._at(lambda s: jax.lax.dynamic_slice_in_dim(values, s * (p - 1), p), t)
 
@@ -91,7 +92,7 @@ class Trajectory(eqx.Module):
         return interpolate(self.reference_nodes, pick(s), tau)
 
     def clock(self, t: Array) -> Array:
-        """What the polynomials are in, at the times `t`."""
+        """The variable of the polynomials at the times `t`: t, or s on an infinite horizon."""
         if self.stretch is None:
             return t
         since = t - self.t[0]
@@ -185,7 +186,8 @@ def _polished(extremal: Extremal, t: Array) -> Point:
         largest = extremal.largest(jnp.abs(held), t)
         h_u = jax.jacfwd(problem.path_constraints, argnums=2)(t, x, u)
         force = largest[: len(u)] + largest[len(u) :] @ jnp.abs(h_u)
-    polished = polish_control(problem, t, x, u, costate, integral, force)
+    size = size_along(extremal.u, problem.control_bounds)  # the same at all times
+    polished = polish_control(problem, t, x, u, costate, integral, force, size)
     if extremal.u_before is not None:
         polished = jnp.clip(polished, *bounds_of(problem.control_bounds, len(u), u.dtype))
     return Point(x, polished, costate)

@@ -160,6 +160,95 @@ def test_active_bounds_are_flagged(double_integrator):
     np.testing.assert_array_equal(s.bound_active, [True, False, False, False, False, False])
 
 
+LENGTH, TIME, CONTROL = 1e-7, 1e3, 1e-9
+
+
+class SmallUnits(DoubleIntegrator):
+    """The double integrator in lengths of 1e-7, times of 1e3 and controls of 1e-9: u runs from
+    6e-9 to -6e-9. Beside it p' = w, of which w would be 0 but is at least 2e-9."""
+
+    k: float = LENGTH / (TIME**2 * CONTROL)
+    target = (LENGTH, 0.0)
+    state_names = ("x", "v", "p")
+    control_names = ("u", "w")
+    initial_state = (0.0, 0.0, 0.0)
+    final_time = TIME
+    control_bounds = (-10 * CONTROL, 10 * CONTROL)  # reached nowhere: they tell the size
+    path_bounds = (2 * CONTROL, jnp.inf)
+
+    def dynamics(self, t, x, u):
+        return jnp.stack([x[1], self.k * u[0], u[1]])
+
+    def running_cost(self, t, x, u):
+        return 0.5 * jnp.sum((u / CONTROL) ** 2) / TIME
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return xf[:2] - jnp.stack(self.target)
+
+    def path_constraints(self, t, x, u):
+        return u[1:]
+
+
+def test_controls_of_any_size_between_nodes():
+    """Nothing is small or large by its number alone: w stays on its constraint between nodes."""
+    e = jg.solve(SmallUnits(), jg.Pseudospectral(nodes=4, segments=2, refinements=0))
+    exact = lambda s: CONTROL * np.stack([6 - 12 * s, np.full_like(s, 2.0)], axis=1)
+    costates = lambda s: np.stack([-12 + 0 * s, TIME * (12 * s - 6), 0 * s], axis=1) / LENGTH
+    np.testing.assert_allclose(e.u, exact(e.t / TIME), rtol=0, atol=1e-7 * CONTROL)  # the barrier
+    nodes, ends = np.asarray(e.t) / TIME, np.asarray(e.breaks[1:]) / TIME
+    e = dataclasses.replace(
+        e,
+        u=jnp.asarray(exact(nodes)),
+        u_before=jnp.asarray(exact(ends)),
+        costate=jnp.asarray(costates(nodes)),
+        costate_before=jnp.asarray(costates(ends)),
+    )
+    s = np.array([0.0, 0.07, 0.3, 0.5, 0.61, 0.95, 1.0])
+    u = at(e, jnp.asarray(TIME * s)).u
+    np.testing.assert_allclose(u, exact(s), rtol=0, atol=1e-9 * CONTROL)
+
+
+def test_bounds_of_any_size_are_flagged(double_integrator):
+    class Scaled(DoubleIntegrator):
+        k: float = LENGTH / (TIME**2 * CONTROL)
+        target = (LENGTH, 0.0)
+        final_time = TIME
+
+        def running_cost(self, t, x, u):
+            return 0.5 * (u[0] / CONTROL) ** 2 / TIME
+
+    e, times = jg.solve(Scaled(), SMALL), TIME * np.array([0.0, 0.2, 0.5, 0.9])
+    for name, width, active in (
+        ("control_bounds", 6.1 * CONTROL, [False, False, False, False]),
+        ("control_bounds", 5.0 * CONTROL, [True, False, False, False]),  # |6 - 12 s| > 5
+        ("state_bounds", (1.1 * LENGTH, 1.1 * LENGTH / TIME), [False, False, True, False]),
+    ):
+        bounds = jnp.asarray(width)
+        bounded = dataclasses.replace(e.problem, **{name: (-bounds, bounds)})
+        s = jg.gain_schedule(dataclasses.replace(e, problem=bounded), times)
+        np.testing.assert_array_equal(s.bound_active, active)
+        assert bool(s.resolved.all())
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_a_polished_control_is_near_in_its_own_size(unit):
+    """u (1 - u^2/3)-like: H = (u^2/2 - u^4/12)/unit^2 has H_u = 0 at 0 and at sqrt(3) units."""
+    from jaxguide.conditions.control import polish_control
+
+    class Quartic(DoubleIntegrator):
+        def running_cost(self, t, x, u):
+            return 0.5 * (u[0] / unit) ** 2 - (u[0] / unit) ** 4 / 12
+
+    zero, one = jnp.zeros(2), jnp.ones(1) * unit
+    polish = lambda u, force: polish_control(
+        Quartic(), 0.0, zero, u * one, zero, jnp.zeros(0), force * jnp.ones(1) / unit, one
+    )
+    # One step from u leaves u^3 of order 1e-11; from 0.1 it would be longer than 1e-3 of the size.
+    np.testing.assert_allclose(polish(2e-4, 0.0), 0.0, rtol=0, atol=1e-11 * unit)
+    np.testing.assert_array_equal(polish(0.1, 0.0), 0.1 * one)
+    np.testing.assert_array_equal(polish(2e-4, 1e-6), 2e-4 * one)  # a constraint holds it
+
+
 def test_free_final_time_against_a_closed_form(free_time):
     # From (x, v) with T left: u = 6 d/T^2 - 4 v/T, d = 1 - x, where T minimises
     # T + 6 d^2/T^3 - 6 d v/T^2 + 2 v^2/T: c(d, v, T) = 0 below.

@@ -105,8 +105,13 @@ ORDER: dict[str, tuple[str, ...]] = {
     "neighboring": (
         "linearization",
         "collocated",
+        "breaks",
+        "sweep",
         "segmented",
         "sufficiency",
+        "costate_gains",
+        "propagation",
+        "gain_map",
         "gains",
         "suboptimal",
     ),

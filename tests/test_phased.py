@@ -129,6 +129,26 @@ def test_phases_are_edited_where_they_are():
     assert held.objective > 1.5 + 1e-3 and held.u[:, 0].max() <= 2.5
 
 
+class Timed(First):
+    """As `First`, its final time a property."""
+
+    share: float = 0.5
+
+    @property
+    def final_time(self):
+        return self.share
+
+
+def test_a_phase_whose_final_time_is_a_property():
+    phased = jg.Phased((Timed(), Second()))
+    e = jg.solve(phased, jg.Pseudospectral(nodes=6, segments=1, refinements=0))
+    np.testing.assert_allclose(e.objective, 6.0, rtol=1e-9)
+    for phase, (a, b) in zip(phased.split(e), ((0.0, 0.5), (0.5, 1.0)), strict=True):
+        times = (phase.t[0], phase.t[-1], phase.problem.final_time)
+        np.testing.assert_allclose(times, (a, b, b), rtol=0, atol=1e-15)
+        assert bool(phase.certificate.passed.all()), str(phase.certificate)
+
+
 class Jump(eqx.Module):
     """The second phase starts `by` further on."""
 

@@ -6,13 +6,14 @@
 
 import dataclasses
 import math
+import runpy
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator
+from conftest import SMALL, DoubleIntegrator
 
 import jaxguide as jg
 from jaxguide.bounds import bounds_of
@@ -215,6 +216,115 @@ def test_bounds_broadcast():
     lo, hi = bounds_of((-1.0, (2.0, 3.0)), 2, jnp.result_type(float))
     np.testing.assert_array_equal(lo, [-1.0, -1.0])
     np.testing.assert_array_equal(hi, [2.0, 3.0])
+
+
+# Boundary data that follow from other fields: properties --------------------------------------
+
+SCRIPT = """
+from __future__ import annotations
+
+import jax.numpy as jnp
+import jaxguide as jg
+
+
+class Hop(jg.Problem):
+    half: float = 0.5
+    lead: float = 0.0
+    state_names = ("x", "v")
+    control_names = ("u",)
+
+    @property
+    def final_time(self):
+        return 2 * self.half
+
+    @property
+    def initial_state(self):
+        return (self.lead, 0.0)
+
+    def dynamics(self, t, x, u):
+        return jnp.stack([x[1], u[0]])
+
+    def running_cost(self, t, x, u):
+        return 0.5 * u[0] ** 2
+
+    def endpoint_constraints(self, x0, xf, t0, tf):
+        return xf - jnp.array([1.0, 0.0])
+"""
+
+
+@pytest.fixture(scope="module")
+def hop(tmp_path_factory):
+    """A user's script: `lead` ahead of the start, from rest to rest at 1 in twice `half`; the
+    cost is 6 (1 - lead)^2 / (2 half)^3."""
+    script = tmp_path_factory.mktemp("user") / "script.py"
+    script.write_text(SCRIPT)
+    return runpy.run_path(str(script), run_name="__main__")["Hop"]
+
+
+def test_properties_are_no_fields(hop):
+    names = [f.name for f in dataclasses.fields(hop)]
+    assert "final_time" not in names and "initial_state" not in names and "half" in names
+    p = dataclasses.replace(hop(), half=2.0)
+    assert (p.final_time, p.initial_state, hop().final_time) == (4.0, (0.0, 0.0), 1.0)
+    assert 1.0 not in jax.tree_util.tree_leaves(hop())  # the final time
+    for change in (dict(final_time=2.0), dict(initial_state=(0.0, 0.0))):
+        with pytest.raises(TypeError, match=next(iter(change))):
+            dataclasses.replace(p, **change)
+        with pytest.raises(TypeError, match=next(iter(change))):
+            hop(**change)
+    validate(p)
+    assert "final_time -2.0 is not after" in refusal(hop(half=-1.0))
+
+
+def test_a_problem_with_properties_is_solved_and_transformed(hop):
+    solved = lambda p: jg.solve(p, SMALL, throw=False)
+    e = jg.solve(dataclasses.replace(hop(), half=1.0), SMALL)
+    assert float(e.final_time) == 2.0 and e.problem.final_time == 2.0
+    np.testing.assert_allclose(e.objective, 6 / 8, rtol=1e-9)
+    by = lambda half, lead: solved(hop(half=half, lead=lead)).objective
+    cost, slopes = jax.jit(jax.value_and_grad(by, argnums=(0, 1)))(0.5, 0.5)
+    np.testing.assert_allclose((cost, *slopes), (1.5, -9.0, -6.0), rtol=1e-7)
+    mapped = jax.vmap(lambda p: solved(p).objective)(jax.vmap(hop)(jnp.array([0.5, 1.0])))
+    np.testing.assert_allclose(mapped, [6, 6 / 8], rtol=1e-9)
+
+
+def test_properties_and_subclasses():
+    class Twice(DoubleIntegrator):
+        @property
+        def final_time(self):
+            return 2 * self.k
+
+    class Fixed(Twice):  # a plain value over a property: a field again
+        final_time = 3.0
+
+    class Again(Fixed):
+        @property
+        def final_time(self):
+            return 4 * self.k
+
+    class FromOutside:
+        @property
+        def final_time(self):
+            return 5 * self.k
+
+    class Mixed(FromOutside, DoubleIntegrator):
+        pass
+
+    assert [p(k=1.5).final_time for p in (Twice, Fixed, Again, Mixed)] == [3.0, 3.0, 6.0, 7.5]
+    assert dataclasses.replace(Fixed(), final_time=4.0).final_time == 4.0
+    for kind in (Twice, Again, Mixed):
+        with pytest.raises(TypeError, match="final_time"):
+            dataclasses.replace(kind(), final_time=4.0)
+
+    class Started(DoubleIntegrator):
+        @property
+        def initial_state(self):
+            return (self.k, 0.0)
+
+    with pytest.raises(TypeError, match="Listed.initial_state is a list, but a property of Start"):
+
+        class Listed(Started):
+            initial_state = [0.0, 0.0]
 
 
 # Refusals: each names the field, its value and the remedy -------------------------------------

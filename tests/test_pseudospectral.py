@@ -354,7 +354,7 @@ def test_a_start_outside_its_bounds_is_refused(start):
 
 def test_a_method_is_an_instance():
     with pytest.raises(ValueError, match=r"give an instance, such as jg.Pseudospectral\(\)"):
-        jg.solve(DoubleIntegrator(), jg.Pseudospectral)
+        jg.solve(DoubleIntegrator(), cast(Any, jg.Pseudospectral))
 
 
 class Undefined(DoubleIntegrator):

@@ -1,15 +1,25 @@
-"""Controls that are angles: jumps of 2 pi removed."""
+"""Controls that are angles, recognised by the Problem's periodicity: jumps of 2 pi removed."""
 
-import jax.flatten_util
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.problem import Problem
 
+# Relative to the largest rate along the nodes: what a quarter turn must change at least, and what a
+# whole turn may at most (rounding of sine and cosine leaves 1e-15).
+_FELT, _SAME = 1e-6, 1e-9
 
-def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"]) -> Array:
-    """Removes jumps of 2 pi from controls in which the Problem is periodic."""
+
+def unwrap_angles(
+    problem: Problem,
+    t: Float[Array, " node"],
+    x: Float[Array, "node n"],
+    u: Float[Array, "node m"],
+) -> Float[Array, "node m"]:
+    """`u` without jumps of 2 pi, in those controls (radians) in which dynamics and running cost
+    have that period at every node; the others as they are."""
     rates = jax.vmap(
         lambda t, x, u: jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
     )
@@ -19,9 +29,9 @@ def unwrap_angles(problem: Problem, t: Array, x: Array, u: Float[Array, "node m"
         moved = lambda by, j=j: rates(t, x, u.at[:, j].add(by))
         there, aside = moved(turn), moved(turn / 4)
         size = jnp.max(jnp.maximum(jnp.abs(here), jnp.abs(there)), axis=0)[None]
-        # Where a quarter turn is nothing either, the control is no angle.
-        felt = jnp.any(jnp.abs(here - aside) > 1e-6 * size)
-        periodic = felt & jnp.all(jnp.abs(here - there) <= 1e-9 * size)
+        # Where a quarter turn changes nothing either, the control is no angle.
+        felt = jnp.any(jnp.abs(here - aside) > _FELT * size)
+        periodic = felt & jnp.all(jnp.abs(here - there) <= _SAME * size)
         turns = jnp.round(jnp.diff(u[:, j]) / turn)
         total = jnp.concatenate([jnp.zeros(1, u.dtype), jnp.cumsum(turns)])
         columns.append(jnp.where(periodic, u[:, j] - turn * total, u[:, j]))

@@ -1,4 +1,4 @@
-"""The canonical equations with the control eliminated: 2002 paper eqs (2), (6), (7)."""
+"""The canonical equations with the control eliminated: 2002 paper, eqs (2), (6), (7)."""
 
 from typing import Any
 
@@ -12,8 +12,11 @@ from jaxguide.problem import Problem
 
 
 @jax.jit
-def canonical_rates(problem: Problem, t: Any, y: Float[Array, " two_n_1"]) -> Array:
-    """d/dt of (x, lambda, cost): eqs (2), (6), with u from eq. (7)."""
+def canonical_rates(
+    problem: Problem, t: Any, y: Float[Array, " two_n_1"]
+) -> Float[Array, " two_n_1"]:
+    """d/dt of (x, lambda, cost), each per unit of time: 2002 paper, eqs (2), (6), with u from
+    eq. (7)."""
     n = problem.n
     x, costate = y[:n], y[n : 2 * n]
     u = minimising_control(problem, t, x, costate)
@@ -22,8 +25,8 @@ def canonical_rates(problem: Problem, t: Any, y: Float[Array, " two_n_1"]) -> Ar
     return jnp.concatenate([problem.dynamics(t, x, u), -h_x, cost[None]])
 
 
-def optimal_hamiltonian(problem: Problem, t: Any, y: Array) -> Array:
-    """H at the minimising control."""
+def optimal_hamiltonian(problem: Problem, t: Any, y: Float[Array, " two_n_1"]) -> Float[Array, ""]:
+    """H at the minimising control (2002 paper, eqs (4), (7)), for y = (x, lambda, cost)."""
     n = problem.n
     u = minimising_control(problem, t, y[:n], y[n : 2 * n])
     return hamiltonian(problem, t, y[:n], u, y[n : 2 * n])

@@ -1,4 +1,4 @@
-"""How large each quantity of an extremal is: what errors are relative to, in any units."""
+"""How large each quantity of an extremal is, in its own unit: errors are relative to this."""
 
 from typing import Any, NamedTuple
 
@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import largest_bound, positive
+from jaxguide.bounds import largest_bound, positive, size_along
 from jaxguide.problem import Problem
 
-# A state below this share of what the others would move it by is at rest: its size is `_MOVED` of
-# that.
+# A state is at rest if it stays below `_REST` of the distance by which its rate, with all terms of
+# one sign, could move it over the horizon; its size is then `_MOVED` of that. By experiment.
 _REST, _MOVED = 1e-6, 1e-3
-_TERMS = 1e-3  # of the terms of H, where they cancel
+_TERMS = 1e-3  # part of the largest terms of H below which H, their sum, does not count as small
 
 
 class Sizes(NamedTuple):
@@ -21,13 +21,14 @@ class Sizes(NamedTuple):
     x: Float[Array, " n"]
     u: Float[Array, " m"]
     t: Float[Array, ""]  # the horizon
-    cost: Float[Array, ""]  # what states and costates together are worth
+    cost: Float[Array, ""]  # the largest costate times the size of its state, or endpoint cost
     hamiltonian: Float[Array, ""]
     path: Float[Array, " p"]
     end: Float[Array, " q"]
 
     @property
     def costate(self) -> Float[Array, " n"]:
+        """Change of the cost per change of a state by its size, over that size."""
         return self.cost / self.x
 
 
@@ -39,16 +40,16 @@ def sizes_of(
     costate: Float[Array, "node n"],
     integral: Float[Array, " r"],
 ) -> Sizes:
-    """Of a state the largest value, or where it rests what the others would move it by; of
-    constraints what a change of everything by its size amounts to, or a bound.
+    """Sizes along a trajectory with its costates.
+
+    Of a state: its largest value, or if it is at rest the distance by which the others could move
+    it. Of a control: its largest value, or its largest bound if it is zero. Of a constraint: how
+    much it changes when every state and control changes by its size, or its largest bound.
 
     `integral`: the multipliers of the integral constraints.
     """
     horizon = t[-1] - t[0]
-    u_size = jnp.max(jnp.abs(u), axis=0)
-    u_size = positive(
-        jnp.where(u_size > 0, u_size, largest_bound(problem.control_bounds, problem.m))
-    )
+    u_size = size_along(u, problem.control_bounds)
     x_size = state_sizes(problem, t, x, u)
     z = jnp.concatenate([x_size, u_size])
     along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))
@@ -75,7 +76,8 @@ def end_sizes(
     x: Float[Array, "node n"],
     x_size: Float[Array, " n"],
 ) -> Float[Array, " q"]:
-    """Sizes of the endpoint constraints, from those of the states."""
+    """Sizes of the endpoint constraints: how much they change when states at both ends and times
+    change by their sizes, or their largest bound."""
     e = lambda x0, xf, times: problem.endpoint_constraints(x0, xf, times[0], times[1])
     slopes = jax.jacfwd(e, argnums=(0, 1, 2))(x[0], x[-1], jnp.stack([t[0], t[-1]]))
     horizon = jnp.broadcast_to(t[-1] - t[0], (2,))

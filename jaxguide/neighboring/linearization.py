@@ -1,4 +1,5 @@
-"""The linear two-point boundary-value problem about an extremal, eqs (11)-(21), by autodiff."""
+"""The linear two-point boundary-value problem about an extremal by autodiff: 2002 paper,
+eqs (11)-(21)."""
 
 import dataclasses
 import functools
@@ -53,7 +54,8 @@ def second_variation(
     costate: Float[Array, " n"],
     parameters: tuple[str, ...] = (),
 ) -> SecondVariation:
-    """f_x, f_u and the Hessian of H at one point; with the parameters' columns beside."""
+    """f_x, f_u and the Hessian of H at one point, and their derivatives by the parameters named:
+    2002 paper, eqs (11)-(13)."""
     n, m = problem.n, problem.m
     p = parameter_values(problem, parameters, x.dtype)
     z = jnp.concatenate([x, u, p])
@@ -82,7 +84,8 @@ def second_variation(
 
 
 class Canonical(NamedTuple):
-    """y' = M y + b dp for y = (dx, dlambda), and du = U y + U_p dp: eqs (16)-(21)."""
+    """y' = M y + b dp for y = (dx, dlambda), and du = U y + U_p dp: 2002 paper, eqs
+    (16)-(21)."""
 
     M: Float[Array, "two_n two_n"]
     b: Float[Array, "two_n p"]
@@ -92,14 +95,15 @@ class Canonical(NamedTuple):
 
 @jax.jit
 def canonical(v: SecondVariation) -> Canonical:
-    """Eliminates du by eq. (16). A singular H_uu gives non-finite entries, which callers flag."""
+    """Eliminates du: 2002 paper, eq. (16). A singular H_uu gives entries that are not finite, which
+    callers flag."""
     rows = jnp.concatenate([v.H_xu.T, v.f_u.T, v.H_up], axis=1)
     gain = -_inverse_times(v.H_uu, rows)  # du in terms of (dx, dlambda, dp)
     n = v.f_x.shape[0]
     U, U_p = gain[:, : 2 * n], gain[:, 2 * n :]
-    A = v.f_x + v.f_u @ U[:, :n]  # eq. (19)
-    B = v.f_u @ U[:, n:]  # eq. (20)
-    Q = v.H_xx + v.H_xu @ U[:, :n]  # eq. (21)
+    A = v.f_x + v.f_u @ U[:, :n]  # 2002 paper, eq. (19)
+    B = v.f_u @ U[:, n:]  # 2002 paper, eq. (20)
+    Q = v.H_xx + v.H_xu @ U[:, :n]  # 2002 paper, eq. (21)
     M = jnp.concatenate(
         [jnp.concatenate([A, B], axis=1), jnp.concatenate([-Q, -A.T], axis=1)], axis=0
     )
@@ -124,7 +128,7 @@ class Terminal(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="parameters")
 def terminal_conditions(extremal: Extremal, parameters: tuple[str, ...] = ()) -> Terminal:
-    r"""Eq. (15) for any endpoint constraint, $\nu$ (and $d t_f$) eliminated automatically.
+    r"""The 2002 paper's eq. (15) for any endpoint constraint, $\nu$ (and $d t_f$) eliminated.
 
     The conditions e = target, lambda = dEbar/dx and, if tf is free, H + dEbar/dtf = 0 are
     linearised about the end, along the flow for a change of tf. A reduced basis of the left null
@@ -176,7 +180,8 @@ def terminal_conditions(extremal: Extremal, parameters: tuple[str, ...] = ()) ->
 
 
 class LinearTPBVP(eqx.Module):
-    """Eqs (11)-(21) at times `t`: arrays with a leading time axis, and the end conditions."""
+    """2002 paper, eqs (11)-(21), at times `t`: arrays with a leading time axis, and the end
+    conditions."""
 
     t: Float[Array, " time"]
     f_x: Float[Array, "time n n"]
@@ -198,8 +203,8 @@ def refuse_integrals(extremal: Extremal, what: str) -> None:
     """Raises `ValueError` if integral constraints bind the extremal's neighbours together."""
     if extremal.multipliers.integral.shape[-1]:
         raise ValueError(
-            f"{what}: {type(extremal.problem).__name__} has integral constraints, of which the "
-            "second variation knows nothing; state each integral as a further state that starts "
+            f"{what}: {type(extremal.problem).__name__} has integral constraints, which the "
+            "second variation leaves out; state each integral as a further state that starts "
             "at 0 and is constrained at the end."
         )
 
@@ -207,11 +212,13 @@ def refuse_integrals(extremal: Extremal, what: str) -> None:
 def linearize(extremal: Extremal, t: Any) -> LinearTPBVP:
     """The linear TPBVP of neighbouring extremals about `extremal` at times `t` (T,).
 
-    **Returns:** f_x, f_u, H_xx, H_xu, H_uu (eqs 11-13), A, B, Q (eqs 19-21), `U` with
-    du = U (dx, dlambda) (eq. 16), psi_x and psi_lambda (eq. 15; n rows, defined up to row
-    operations), and the change of a free final time, dtf = dtf_dx dx_f + dtf_dlambda dlambda_f.
+    **Returns:** f_x, f_u, H_xx, H_xu, H_uu (2002 paper, eqs (11)-(13)), A, B, Q (eqs (19)-(21)),
+    `U` with du = U (dx, dlambda) (eq. (16)), psi_x and psi_lambda (eq. (15); n rows, defined up to
+    row operations), and the change of a free final time, dtf = dtf_dx dx_f + dtf_dlambda dlambda_f.
 
-    **Error:** rounding; the extremal's own error enters once.
+    **Error:** that of the extremal, to first order, and rounding.
+
+    **Raises:** `ValueError` for times that are no vector, and for integral constraints.
     """
     t = jnp.asarray(t, extremal.t.dtype)
     if t.ndim != 1:

@@ -1,5 +1,5 @@
-"""Neighbouring suboptimal gains: how optimal parameters of a piecewise-linear control change with
-the state met on the way (thesis, chapter 3; Hull & Helfrich)."""
+"""Neighbouring suboptimal gains: how the optimal parameters of a piecewise-linear control change
+with the state met on the way (thesis, chapter 3, after Hull & Helfrich)."""
 
 from typing import Any, NamedTuple
 
@@ -7,8 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from jaxguide.bounds import positive, size_along
 from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, polished
@@ -16,7 +17,10 @@ from jaxguide.problem import is_free
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced, require_x64
 
-_RANK = 1e-9  # of scaled constraint rows, below which they count as dependent
+# Least pivot of the Gram matrix of unit constraint rows below which they count as dependent. Pivots
+# are squares of sines: rows that differ by an angle of 3e-5 count as independent, and rounding
+# leaves 1e-15. By experiment on stations close to the end of the lunar launch.
+_RANK = 1e-9
 
 
 class SuboptimalSchedule(eqx.Module):
@@ -25,8 +29,8 @@ class SuboptimalSchedule(eqx.Module):
     `K` (g, k, m, n): change of the control at each of the k nodes per deviation of the state at
     each station; a station between nodes replaces the last node passed. `K_time` (g, n): change of
     the final time as a parameter of the whole horizon; the time to go from the station changes by
-    (1 - tau) of it. A law needs little of `K`: `here` (g, m, n), the change at the station, and
-    `ahead` (g, m, n), that at the next node, `spacing` (g,) of the horizon away.
+    (1 - tau) of it. A law uses two of the k nodes: `here` (g, m, n) is the change at the station,
+    `ahead` (g, m, n) that at the next node, `spacing` (g,) of the horizon away. All in user units.
     """
 
     stations: Float[Array, " g"]
@@ -42,11 +46,12 @@ class SuboptimalSchedule(eqx.Module):
 
     @property
     def initial_time(self) -> Float[Array, ""]:
+        """When the nominal starts."""
         return self.extremal.t[0]
 
     @property
     def duration(self) -> Float[Array, ""]:
-        """Of the nominal."""
+        """How long the nominal's horizon is, in its unit of time."""
         return self.extremal.t[-1] - self.extremal.t[0]
 
     def state(self, tau: Any) -> Float[Array, " n"]:
@@ -65,25 +70,27 @@ class SuboptimalSchedule(eqx.Module):
 
 
 class Sensitivities(NamedTuple):
-    """From each station: of the end by the state there (Phi^-1) and by the parameters; the second
-    derivatives of the augmented cost G = J + nu^T psi, by parameters and by them and the state."""
+    """Derivatives of what follows each station, by the state x there and by the parameters a.
 
-    end_state: Float[Array, "g n n"]
-    end_parameters: Float[Array, "g n p"]
-    psi_state: Float[Array, "g q n"]
-    psi_parameters: Float[Array, "g q p"]
+    G = J + nu^T psi is the augmented cost: thesis, eq. (3.1).
+    """
+
+    end_state: Float[Array, "g n n"]  # dx_f/dx = Phi^-1
+    end_parameters: Float[Array, "g n p"]  # dx_f/da = -Phi^-1 Psi
+    psi_state: Float[Array, "g q n"]  # psi_x Phi^-1
+    psi_parameters: Float[Array, "g q p"]  # -psi_x Phi^-1 Psi
     G_aa: Float[Array, "g p p"]
     G_ax: Float[Array, "g p n"]
 
     @property
     def Phi(self) -> Float[Array, "g n n"]:
-        """Transition matrix of eq. (3.8), dx = Phi dx_f + Psi da: eqs (3.12), (3.14)."""
+        """Transition matrix of dx = Phi dx_f + Psi da: thesis, eqs (3.8), (3.12), (3.14)."""
         eye = jnp.broadcast_to(jnp.eye(self.end_state.shape[1]), self.end_state.shape)
         return jax.vmap(gauss_solve)(self.end_state, eye)
 
     @property
     def Psi(self) -> Float[Array, "g n p"]:
-        """Eqs (3.13), (3.15)."""
+        """Effect of the parameters on the state at the station: thesis, eqs (3.13), (3.15)."""
         return -self.Phi @ self.end_parameters
 
 
@@ -96,12 +103,12 @@ def suboptimal_gains(
 
     **Arguments:**
 
-    - `form`: "whole" is the thesis's, eq. (3.25): the change of all parameters, those of passed
-      nodes too, that costs least by the second derivatives of the whole trajectory's cost while
-      the end is met; what falls on passed nodes is then discarded, and with it optimality.
-      "remaining": the derivative of the parameters that are optimal from the station on, about
-      their own optimum (a tail of an optimal parameter vector is not quite optimal itself), the
-      change of their gradient with the state included.
+    - `form`: "whole" is thesis, eq. (3.25): of the changes of all parameters that meet the end, the
+      one that costs least by the second derivatives of the whole trajectory's cost. Nodes passed
+      are changed too; their share is then discarded, and with it optimality. "remaining": the
+      derivative of the parameters that are optimal from the station on, about their own optimum (a
+      tail of an optimal parameter vector is not quite optimal itself), including how their gradient
+      changes with the state.
     - `stations` (g,): fractions of the horizon in [0, 1), ascending; default every node from which
       the end can still be controlled.
 
@@ -110,7 +117,7 @@ def suboptimal_gains(
     **Raises:** `ValueError` for an extremal of another kind; for a station from which fewer
     parameters remain than there are endpoint constraints, or whose parameters do not move them.
 
-    **Source:** thesis, eqs (3.1)-(3.25); G_aa here is exact.
+    **Source:** thesis, eqs (3.1)-(3.25); G_aa, there by finite differences, is exact here.
     """
     require_x64("jg.suboptimal_gains")
     if not extremal.parametric:
@@ -147,10 +154,10 @@ def suboptimal_gains(
 def sensitivities(
     extremal: Extremal, stations: Float[Array, " g"], whole: bool = True
 ) -> Sensitivities:
-    """First and second derivatives of what follows each station, by autodiff of the flow.
+    """First and second derivatives of the trajectory after each station, by autodiff of the flow.
 
-    `whole`: with the Hessian of the whole trajectory at every station, stations moving with tf;
-    else with that of what remains, the clock at the station standing still.
+    `whole`: stations move with tf, and the Hessian G_aa is that of the whole trajectory at every
+    station. Otherwise the time at the station is held, and the Hessian is that of the rest.
     """
     positions = (extremal.breaks - extremal.t[0]) / (extremal.t[-1] - extremal.t[0])
     a, nu, x = _nominal(extremal, positions, stations)
@@ -198,7 +205,7 @@ def _schedule(
 ) -> tuple[SuboptimalSchedule, Float[Array, " g"]]:
     problem = extremal.problem
     a, nu, x = _nominal(extremal, positions, stations)
-    p, q, k, m = a.shape[0], nu.shape[0], positions.shape[0], problem.m
+    p, k, n, m = a.shape[0], positions.shape[0], problem.n, problem.m
     free = is_free(problem.final_time)
 
     if whole:
@@ -209,21 +216,8 @@ def _schedule(
         fit = lambda tau, x: _remaining(extremal, positions, a, nu, tau, x)
         s, active = jax.vmap(fit)(stations, x)
 
-    def gain(s: Sensitivities, active: Array) -> tuple[Array, Array]:
-        # Parameters that no longer count stay where they are.
-        G = jnp.where(active[:, None] & active[None, :], s.G_aa, 0.0)
-        scale = jnp.max(jnp.abs(G)) + jnp.finfo(G.dtype).tiny
-        G = G + jnp.diag(jnp.where(active, 0.0, scale))
-        D = jnp.where(active[None, :], s.psi_parameters, 0.0)
-        rows = jnp.sqrt(jnp.sum(D**2, axis=1, keepdims=True))
-        rows = jnp.where(rows > 0, rows, 1.0)
-        D, C = D / rows, s.psi_state / rows
-        kkt = jnp.block([[G / scale, D.T], [D, jnp.zeros((q, q), G.dtype)]])
-        right = jnp.concatenate([jnp.where(active[:, None], s.G_ax, 0.0) / scale, C])
-        return -gauss_solve(kkt, right)[:p], _dependence(D)
-
-    K, rank = jax.vmap(gain)(s, active)
-    n = problem.n
+    a_size = _parameter_sizes(extremal, k)
+    K, rank = jax.vmap(lambda s, active: _gain(s, active, a_size))(s, active)
     K_time = K[:, -1] if free else jnp.zeros((stations.shape[0], n), K.dtype)
     K = K[:, : k * m].reshape(-1, k, m, n)
     controls = par.unpack(problem, a)[0]
@@ -248,6 +242,50 @@ def _schedule(
     return schedule, rank
 
 
+def _parameter_sizes(extremal: Extremal, k: int) -> Float[Array, " p"]:
+    """How large each parameter is along the nominal: k controls a node, and a free duration."""
+    problem = extremal.problem
+    sizes = jnp.tile(size_along(extremal.u, problem.control_bounds), k)
+    return (
+        jnp.append(sizes, extremal.t[-1] - extremal.t[0]) if is_free(problem.final_time) else sizes
+    )
+
+
+def _gain(
+    s: Sensitivities, active: Bool[Array, " p"], size: Float[Array, " p"]
+) -> tuple[Float[Array, "p n"], Float[Array, ""]]:
+    """da/dx at one station, and how independent the constraints are of each other (`_dependence`).
+
+    Thesis, eq. (3.25), with P = psi_x Phi^-1:
+
+        K_0 = G_aa^-1 (P Psi)^T [(P Psi) G_aa^-1 (P Psi)^T]^-1 P
+
+    which is K of the linear system
+
+        [ G_aa  D^T ] [  K  ]     [ G_ax ]
+        [  D     0  ] [dnu/dx] = -[  C   ],   D = -P Psi,  C = P,
+
+    with G_ax = 0. Solved as such: "remaining" gains have a G_ax, and G_aa need not be regular.
+    """
+    q = s.psi_parameters.shape[0]
+    # Parameters of passed nodes stay where they are.
+    G = jnp.where(active[:, None] & active[None, :], s.G_aa, 0.0)
+    scale = jnp.max(jnp.abs(G)) + jnp.finfo(G.dtype).tiny
+    G = G + jnp.diag(jnp.where(active, 0.0, scale))
+    D = jnp.where(active[None, :], s.psi_parameters, 0.0)
+    rows = _lengths(D)
+    D, C = D / rows, s.psi_state / rows
+    kkt = jnp.block([[G / scale, D.T], [D, jnp.zeros((q, q), G.dtype)]])
+    right = jnp.concatenate([jnp.where(active[:, None], s.G_ax, 0.0) / scale, C])
+    K = -gauss_solve(kkt, right)[: size.shape[0]]  # thesis, eq. (3.25)
+    sized = D * size[None, :]
+    return K, _dependence(sized / _lengths(sized))
+
+
+def _lengths(rows: Float[Array, "q p"]) -> Float[Array, "q 1"]:
+    return positive(jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True)))
+
+
 def _dependence(D: Float[Array, "q p"]) -> Float[Array, ""]:
     """The least pivot of the Gram matrix of unit rows: 0 where they are dependent."""
     gram, least = D @ D.T, jnp.ones((), D.dtype)
@@ -269,8 +307,8 @@ def _remaining(
 def _optimum(
     extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
 ) -> tuple[KKTPoint, Array]:
-    """What is optimal from `tau` on, from the state `x` there, sought from the tail of the nominal;
-    and which parameters count."""
+    """The optimum from the state `x` at `tau` on, found from the tail of the nominal, and which
+    parameters belong to it: those of nodes not yet passed."""
     problem, m = extremal.problem, extremal.problem.m
     k = positions.shape[0]
     first = par.interval(positions, tau)
@@ -286,7 +324,7 @@ def _optimum(
     def values(b: Array, args: Any) -> tuple[Array, Array]:
         problem, positions, start, held = args
         cost, e, _ = par.outcome(problem, positions, b, start, extremal.degree)
-        # A spring on what is passed keeps the system regular and moves nothing.
+        # A quadratic cost on parameters of passed nodes keeps the system regular and moves nothing.
         return cost + 0.5 * jnp.sum(jnp.where(active, 0.0, b - held) ** 2), e
 
     args = (problem, positions, par.Departure(tau, when, x), a)
@@ -297,8 +335,8 @@ def _optimum(
 def remaining_optimum(
     extremal: Extremal, stations: Float[Array, " g"], dx: Float[Array, "g n"]
 ) -> Float[Array, "g p"]:
-    """The parameters that are optimal from each station on, the state there off by `dx`: what the
-    "remaining" gains are the derivative of. Those of passed nodes stand as they were."""
+    """The parameters that are optimal from each station on when the state there is off by `dx`:
+    the "remaining" gains are their derivative. Those of passed nodes keep their values."""
     positions = (extremal.breaks - extremal.t[0]) / (extremal.t[-1] - extremal.t[0])
     a, nu, x = _nominal(extremal, positions, stations)
     best = lambda tau, x: _optimum(extremal, positions, a, nu, tau, x)[0].a

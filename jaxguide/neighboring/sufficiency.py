@@ -1,11 +1,11 @@
-"""Conjugate points ahead: whether the extremal is a minimum from here."""
+"""Conjugate points ahead, which an extremal that is a minimum from here on has none of."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.linalg import cholesky_positive, gauss_solve
-from jaxguide.neighboring.segmented import Sweep
+from jaxguide.neighboring.sweep import Sweep
 
 
 def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
@@ -13,8 +13,8 @@ def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
 
     Across a segment dx(l) = Phi_11 (I + N S) dx(r) with N = Phi_11^-1 Phi_12 >= 0 symmetric, of
     the transition from its end r back to l. Every conjugate point inside turns one eigenvalue of
-    I + N S, all real, negative: counted so (by Cholesky of I + L^T S L, N = L L^T) and not by the
-    sign of a determinant, a pair that falls together is seen too.
+    I + N S, all real, negative. Cholesky of I + L^T S L, N = L L^T, fails for any such eigenvalue;
+    the sign of a determinant would miss two conjugate points at one time.
     """
     n = sweep.scale.shape[0] // 2
     eye = jnp.eye(n, dtype=sweep.scale.dtype)

@@ -28,7 +28,7 @@ def initial_entries(problem: Problem) -> tuple[Any, ...]:
 
 
 def initial_values(problem: Problem, dtype: Any) -> Float[Array, " n"]:
-    """Initial state, free components at their guess (or 0)."""
+    """The initial state, free components where the search for them starts (`start_value`)."""
     entries = problem.initial_state
     if entries is None:
         return jnp.zeros(problem.n, dtype)
@@ -38,7 +38,8 @@ def initial_values(problem: Problem, dtype: Any) -> Float[Array, " n"]:
 
 
 def initial_bounds(problem: Problem) -> tuple[Array, Array]:
-    """Of the initial state, where it is free: its own and those of every state."""
+    """(lower, upper) of the initial state, (n,) each: the state bounds, narrowed by the limits of
+    components that are `Free`."""
     lo, hi = bounds_of(problem.state_bounds, problem.n, jnp.result_type(float))
     entries = [e if is_free(e) else Free() for e in initial_entries(problem)]
     own = [jnp.stack([jnp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
@@ -46,9 +47,11 @@ def initial_bounds(problem: Problem) -> tuple[Array, Array]:
 
 
 def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
-    """A control to start Newton from: the middle of finite bounds, else near 0.
+    """A control to start Newton's method from: near the middle of finite bounds, otherwise near the
+    admissible control closest to 0.
 
-    The slight offset keeps clear of points where H_u = 0 by symmetry (a maximum, say).
+    Near, and not at: a tenth of half the width (or 0.1) keeps clear of points where H_u = 0 by
+    symmetry, which may be maxima. By experiment on the library.
     """
     lo, hi = bounds_of(problem.control_bounds, problem.m, dtype)
     finite = jnp.isfinite(lo) & jnp.isfinite(hi)

@@ -1,4 +1,4 @@
-"""Static parameters of a Problem: where they are held, and the numbers a solver puts there."""
+"""Static parameters of a Problem: fields that hold `Free`, and the numbers a solver puts there."""
 
 import dataclasses
 from typing import Any
@@ -14,7 +14,8 @@ Path = tuple[str | int, ...]  # attributes and indices that lead from a Problem 
 
 
 def with_parameters(problem: Problem, p: Any) -> Problem:
-    """`problem` with the numbers `p` (None: where a search starts) for its `Free` parameters."""
+    """`problem` with the numbers `p` (k,) in place of its `Free` parameters; None: the numbers
+    where a search for them starts."""
     paths = problem.parameter_paths()
     if not paths:
         return problem  # itself, and not a copy
@@ -26,7 +27,7 @@ def with_parameters(problem: Problem, p: Any) -> Problem:
 
 
 def parameters(problem: Problem, like: Problem | None = None) -> list[Any]:
-    """The entries of `problem` at its (or `like`'s) parameter paths."""
+    """The entries of `problem` at its own parameter paths, or at those of `like`."""
     return [
         _follow(problem, path) for path in (problem if like is None else like).parameter_paths()
     ]
@@ -46,9 +47,11 @@ class Chosen(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Their dotted paths, such as "phases.0.final_time"."""
         return tuple(".".join(map(str, path)) for path in self.paths)
 
     def values(self, problem: Problem) -> Float[Array, " k"]:
+        """The numbers that `problem` holds for them."""
         return jnp.stack([as_float(_follow(problem, path)) for path in self.paths])
 
     def into(self, problem: Problem, p: Array) -> Problem:
@@ -67,5 +70,5 @@ def choices(problem: Problem) -> Chosen | None:
 
 
 def replace_parameters(problem: Problem, names: tuple[str, ...], values: Any) -> Problem:
-    """`problem` with scalar fields `names` set to the entries of `values`."""
+    """`problem` with its scalar fields `names` set to the entries of `values` (p,)."""
     return dataclasses.replace(problem, **{name: values[i] for i, name in enumerate(names)})

@@ -2,8 +2,9 @@
 
 import abc
 import dataclasses
+import inspect
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -29,6 +30,7 @@ class Free(eqx.Module):
 
 
 def is_free(x: object) -> bool:
+    """Whether `x` is for the solver to choose."""
     return isinstance(x, Free)
 
 
@@ -38,8 +40,26 @@ class Problem(eqx.Module):
     endpoint constraints $e$ and path constraints $h$ within bounds.
 
     Subclass it, name the states and controls, and write `dynamics`. Parameters are fields; a plant
-    with another thrust is `dataclasses.replace(problem, thrust=...)`. Boundary data may be written
-    as plain class attributes: they become instance leaves (see `__init_subclass__`).
+    with another thrust is `dataclasses.replace(problem, thrust=...)`.
+
+    Boundary data (times, initial state, bounds, names) may be written
+
+    - as plain class attributes, `final_time = 2.0`: they become fields, which `replace`,
+      `equinox.tree_at`, `jax.grad` and `jax.vmap` reach;
+    - as a property, where they follow from other fields:
+
+          class Toss(jg.Problem):
+              speed: float = 10.0
+
+              @property
+              def initial_state(self):
+                  return (0.0, self.speed)
+
+      A property is no field: it has no leaf and cannot be replaced. Replace what it follows from;
+      derivatives by that include what the property does with it.
+
+    **Raises:** `TypeError` for a plain array or list over a property of the base class: write a
+    tuple, or a property.
 
     **Source:** review, eq. (2); H = F + lambda^T f is minimised.
     """
@@ -57,31 +77,24 @@ class Problem(eqx.Module):
 
     def __init_subclass__(cls, **kwargs: Any):
         # Dataclasses ignore an override without annotation, and the base's default would silently
-        # win. Every plain attribute that names an inherited field becomes that field, keyword-only
-        # so that a subclass may still add fields without defaults.
+        # win. Here every plain attribute that names an inherited field becomes that field, and a
+        # property in a field's place is annotated as a ClassVar: dataclasses leave those out.
         super().__init_subclass__(**kwargs)
         annotations = dict(cls.__dict__.get("__annotations__", {}))
         inherited = {
             f.name: f
             for base in reversed(cls.__mro__[1:])
-            for f in getattr(base, "__dataclass_fields__", {}).values()
+            if dataclasses.is_dataclass(base)
+            for f in dataclasses.fields(base)
         }
-        for name, base in inherited.items():
-            if name not in cls.__dict__ or name in annotations:
-                continue
-            value = cls.__dict__[name]
-            if isinstance(value, (property, dataclasses.Field)) or callable(value):
-                continue
-            annotations[name] = base.type
-            options: dict[str, Any] = {"kw_only": base.kw_only}
-            if base.metadata.get("static", False):
-                options["static"] = True
-            if (
-                type(value).__hash__ is None
-            ):  # arrays and lists: dataclasses refuses them as default
-                setattr(cls, name, eqx.field(default_factory=lambda v=value: v, **options))
-            else:
-                setattr(cls, name, eqx.field(default=value, **options))
+        for name, field in inherited.items():
+            value = inspect.getattr_static(cls, name, None)
+            if isinstance(value, property):
+                annotations[name] = ClassVar
+            elif name in cls.__dict__ and name not in annotations:
+                if not isinstance(value, dataclasses.Field) and not callable(value):
+                    annotations[name] = field.type
+                    setattr(cls, name, _restated(cls, field, value))
         cls.__annotations__ = annotations
 
     @abc.abstractmethod
@@ -113,10 +126,10 @@ class Problem(eqx.Module):
         return None
 
     def check_statement(self) -> None:
-        """Refuses, with a `ValueError`, what a kind of Problem knows to be badly stated."""
+        """For kinds of Problems with rules of their own: raises `ValueError` if one is broken."""
 
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
-        """Where a `Free` static parameter is held, for the solver to choose."""
+        """Attributes and indices that lead to each `Free` static parameter."""
         return tuple(
             (f.name,)
             for f in dataclasses.fields(self)
@@ -139,6 +152,25 @@ class Problem(eqx.Module):
         return type(self).optimal_control is not Problem.optimal_control
 
 
+def _restated(cls: type, field: dataclasses.Field, value: Any) -> Any:
+    """The inherited `field` with `value` as its default in `cls`; keyword-only where it was, so
+    that `cls` may still add fields without defaults."""
+    options: dict[str, Any] = {"kw_only": field.kw_only}
+    if field.metadata.get("static", False):
+        options["static"] = True
+    if type(value).__hash__ is not None:
+        return eqx.field(default=value, **options)
+    # Arrays and lists: dataclasses takes them from a factory only, and leaves no attribute of the
+    # class, so that a property of a base class would be in the way.
+    for base in cls.__mro__[1:]:
+        if isinstance(base.__dict__.get(field.name), property):
+            raise TypeError(
+                f"{cls.__name__}.{field.name} is a {type(value).__name__}, but a property of "
+                f"{base.__name__}; write a tuple, or a property as well."
+            )
+    return eqx.field(default_factory=lambda: value, **options)
+
+
 _BOUNDARY = ("initial_time", "final_time", "initial_state")
 
 
@@ -148,7 +180,8 @@ def with_array_leaves(problem: Problem) -> Problem:
 
 
 def start_value(entry: Any) -> Any:
-    """A number, or the point from which a `Free` one is sought: guess, middle, or nearest to 0."""
+    """`entry` if it is a number. Of a `Free` one the point from which a search starts: its guess,
+    otherwise the middle of finite limits, otherwise the admissible number closest to 0."""
     if not is_free(entry):
         return entry
     if entry.guess is not None:

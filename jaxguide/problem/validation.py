@@ -1,4 +1,4 @@
-"""Badly stated problems, refused with the field, its value and the remedy. Host only."""
+"""Badly stated problems are refused with the field, its value and the remedy. Host only."""
 
 import math
 from typing import Any
@@ -13,6 +13,11 @@ from jaxguide.problem.parameters import with_parameters
 from jaxguide.problem.statement import Problem, is_free, start_value, with_array_leaves
 from jaxguide.types import is_traced
 
+# How far an initial state may lie outside the state bounds, relative to 1 + |x0|: arithmetic may
+# have lost that much. In the user's unit, as bounds of (0, inf) tell no size; a start that is
+# further outside in smaller units is found infeasible by the method.
+_ROUNDING = 1e-9
+
 
 @jax.jit
 def _start(problem: Problem) -> tuple[Array, ...]:
@@ -25,12 +30,14 @@ def _start(problem: Problem) -> tuple[Array, ...]:
 
 
 def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: Any) -> tuple:
+    """The shape that the function `name` returns, refused unless `wanted` (None: a vector)."""
     try:
         out = jax.eval_shape(getattr(with_parameters(problem, None), name), *args)
     except Exception as e:
         raise ValueError(
             f"{type(problem).__name__}.{name} could not be evaluated with a state of "
-            f"{problem.n} and a control of {problem.m} components: {e}"
+            f"{problem.n} and a control of {problem.m} components: {e}\nIndex and stack by these "
+            "sizes, with jax.numpy."
         ) from e
     shape = getattr(out, "shape", None)
     if wanted is not None and shape != wanted:
@@ -53,7 +60,9 @@ def _check_names(problem: Problem, name: str) -> None:
             f"such as {name} = ('x',)."
         )
     if len(set(names)) != len(names):
-        raise ValueError(f"{type(problem).__name__}.{name} repeats a name: {names}.")
+        raise ValueError(
+            f"{type(problem).__name__}.{name} repeats a name: {names}; rename one of them."
+        )
 
 
 def _check_bounds(problem: Problem, name: str, size: int) -> None:
@@ -64,19 +73,20 @@ def _check_bounds(problem: Problem, name: str, size: int) -> None:
         lower, upper = (np.broadcast_to(np.asarray(b, float), (size,)) for b in bounds)
     except ValueError as e:
         raise ValueError(
-            f"{type(problem).__name__}.{name} = {bounds} does not broadcast to {size} components."
+            f"{type(problem).__name__}.{name} = {bounds} does not broadcast to {size} components; "
+            "give a number for all of them or one for each."
         ) from e
     bad = ~(lower <= upper)
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(
             f"{type(problem).__name__}.{name}: component {i} has lower {lower[i]} above upper "
-            f"{upper[i]} (or NaN); exchange or repair them."
+            f"{upper[i]} (or NaN); exchange or correct them."
         )
 
 
 def _check_start(problem: Problem, x0: Any) -> None:
-    """Refuses an initial state, or a range of one, outside the state bounds."""
+    """Refuses an initial state outside the state bounds, and a free one whose range is."""
     lower, upper = (
         np.broadcast_to(np.asarray(b, float), (problem.n,)) for b in problem.state_bounds
     )
@@ -85,17 +95,20 @@ def _check_start(problem: Problem, x0: Any) -> None:
     ):
         free = is_free(entry)
         lo, hi = (float(entry.lo), float(entry.hi)) if free else (float(x0[i]), float(x0[i]))
-        slack = 1e-9 * (1 + abs(x0[i]))
+        slack = _ROUNDING * (1 + abs(x0[i]))
         if hi < lower[i] - slack or lo > upper[i] + slack:
             given = f"between {lo} and {hi}" if free else f"{lo}"
             raise ValueError(
                 f"{type(problem).__name__}.initial_state: {name} is {given}, outside state_bounds "
-                f"[{lower[i]}, {upper[i]}]; mend one of the two."
+                f"[{lower[i]}, {upper[i]}]; change one of the two."
             )
 
 
 def check_initial_state(problem: Problem) -> None:
-    """Refuses initial entries that are not one a state."""
+    """Refuses an `initial_state` that has not one entry for each state.
+
+    **Raises:** `ValueError`.
+    """
     kind, n = type(problem).__name__, problem.n
     entries = problem.initial_state
     if entries is not None and not is_free(entries):
@@ -107,7 +120,8 @@ def check_initial_state(problem: Problem) -> None:
         size = len(entries) if isinstance(entries, (tuple, list)) else jnp.shape(entries)[0]
         if size != n:
             raise ValueError(
-                f"{kind}.initial_state has {size} entries for {n} states {problem.state_names}."
+                f"{kind}.initial_state has {size} entries for {n} states {problem.state_names}; "
+                "give a number or jg.Free() for each."
             )
 
 
@@ -123,66 +137,79 @@ def validate(problem: Problem) -> None:
             f"expected an instance of a jaxguide.Problem, got {problem!r}; "
             "did you pass the class and not an instance?"
         )
-    kind = type(problem).__name__
     _check_names(problem, "state_names")
     _check_names(problem, "control_names")
     problem.check_statement()
-    n, m = problem.n, problem.m
-    dtype = jnp.result_type(float)
     check_initial_state(problem)
+    sizes = _check_shapes(problem)
+    if is_traced(problem):
+        return
+    for name, size in sizes.items():
+        _check_bounds(problem, name, size)
+    with jax.ensure_compile_time_eval():  # within a trace of something else, perhaps
+        t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
+    _check_initial_values(problem, x0)
+    _check_horizon(problem, float(t0), float(tf))
+    if not np.all(np.isfinite(rate)) and not any(initially_free(problem)):
+        i = int(np.argmin(np.isfinite(rate)))
+        raise ValueError(
+            f"{type(problem).__name__}.dynamics: d({problem.state_names[i]})/dt is {rate[i]} at "
+            f"the start t={float(t0)}, x={x0}, u={u0}; give state bounds or a guess that keep "
+            "clear of the singularity, or correct the equation."
+        )
+
+
+def _check_shapes(problem: Problem) -> dict[str, int]:
+    """Refuses functions of the wrong shape; the sizes that bounds must have, by their names."""
+    n, m, dtype = problem.n, problem.m, jnp.result_type(float)
     t = jax.ShapeDtypeStruct((), dtype)
     x, u = jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype)
     _shape(problem, "dynamics", (n,), t, x, u)
     _shape(problem, "running_cost", (), t, x, u)
     _shape(problem, "endpoint_cost", (), x, x, t, t)
-    q = _shape(problem, "endpoint_constraints", None, x, x, t, t)[0]
-    p = _shape(problem, "path_constraints", None, t, x, u)[0]
-    r = _shape(problem, "integrands", None, t, x, u)[0]
+    sizes = {
+        "state_bounds": n,
+        "control_bounds": m,
+        "endpoint_bounds": _shape(problem, "endpoint_constraints", None, x, x, t, t)[0],
+        "path_bounds": _shape(problem, "path_constraints", None, t, x, u)[0],
+        "integral_bounds": _shape(problem, "integrands", None, t, x, u)[0],
+    }
     if problem.has_closed_form:
         _shape(problem, "optimal_control", (m,), t, x, x)
-    if is_traced(problem):
-        return
-    for name, size in (
-        ("state_bounds", n),
-        ("control_bounds", m),
-        ("endpoint_bounds", q),
-        ("path_bounds", p),
-        ("integral_bounds", r),
-    ):
-        _check_bounds(problem, name, size)
-    with jax.ensure_compile_time_eval():  # within a trace of something else, perhaps
-        t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
+    return sizes
+
+
+def _check_initial_values(problem: Problem, x0: np.ndarray) -> None:
+    """Refuses an initial state that is not finite, and one outside the state bounds."""
     free = initially_free(problem)
     for i, name in enumerate(problem.state_names):
         if not np.isfinite(x0[i]):
             raise ValueError(
-                f"{kind}.initial_state: {name} is {x0[i]}; give a finite number"
+                f"{type(problem).__name__}.initial_state: {name} is {x0[i]}; give a finite number"
                 + (" as the guess of its jg.Free." if free[i] else " or jg.Free().")
             )
     _check_start(problem, x0)
-    t0, tf = float(t0), float(tf)
+
+
+def _check_horizon(problem: Problem, t0: float, tf: float) -> None:
+    """Refuses times that are no numbers, and a horizon that cannot have a positive length."""
+    kind = type(problem).__name__
+    free_start, free_end = is_free(problem.initial_time), is_free(problem.final_time)
     if math.isnan(t0) or math.isnan(tf) or math.isinf(t0):
         raise ValueError(f"{kind}: initial_time is {t0} and final_time is {tf}; give numbers.")
-    if math.isinf(tf) and is_free(problem.initial_time):
+    if math.isinf(tf) and free_start:
         raise ValueError(
             f"{kind}: final_time is infinite and initial_time is {problem.initial_time}; give a "
             "number for one of the two."
         )
-    if not tf > t0 and not is_free(problem.final_time) and not is_free(problem.initial_time):
+    if not tf > t0 and not free_end and not free_start:
         raise ValueError(
             f"{kind}: final_time {tf} is not after initial_time {t0}; the horizon must be positive."
         )
-    latest = problem.final_time.hi if is_free(problem.final_time) else tf
-    earliest = problem.initial_time.lo if is_free(problem.initial_time) else t0
+    latest = problem.final_time.hi if free_end else tf
+    earliest = problem.initial_time.lo if free_start else t0
     if not float(latest) > float(earliest):
         raise ValueError(
             f"{kind}: final_time is at most {float(latest)} and initial_time at least "
             f"{float(earliest)}; the horizon must be positive."
-        )
-    if not np.all(np.isfinite(rate)) and not any(free):
-        i = int(np.argmin(np.isfinite(rate)))
-        raise ValueError(
-            f"{kind}.dynamics: d({problem.state_names[i]})/dt is {rate[i]} at the start "
-            f"t={t0}, x={x0}, u={u0}; state bounds or a guess that keep "
-            "clear of the singularity, or mend the equation."
         )

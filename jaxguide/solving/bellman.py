@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxguide.problem import Problem
 from jaxguide.solving.solve import default_method, solve
 from jaxguide.trajectory import Extremal
+from jaxguide.transforms.wrapped import restated
 from jaxguide.types import RESULTS, succeeded
 
 
@@ -61,7 +62,7 @@ def bellman(problem: Problem, method: Any = None, segments: int = 4, guess: Any 
         x, spent = _flown(extremal, states[-1], t0, t1)
         cost = cost + spent
         times, states = [*times, t1], [*states, x]
-        problem = dataclasses.replace(problem, initial_time=t1, initial_state=tuple(x))
+        problem = restated(problem, initial_time=t1, initial_state=tuple(x))
         guess = _rest(extremal, t1)
     last = extremals[-1]
     ends = (states[0], states[-1], times[0], times[-1]) if times else None

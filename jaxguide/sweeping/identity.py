@@ -72,9 +72,9 @@ def about(order: Order) -> dict[str, Any]:
     """For people: the numbers of the plant, the law and the dispersions of a sweep."""
     plant = order.mission.plant
     numbers = {
-        name: np.asarray(value).tolist()
-        for name in plant.__dataclass_fields__
-        if eqx.is_array_like(value := getattr(plant, name)) and np.ndim(value) < 2
+        field.name: np.asarray(value).tolist()
+        for field in dataclasses.fields(plant)
+        if eqx.is_array_like(value := getattr(plant, field.name)) and np.ndim(value) < 2
     }
     control = [str(name) for name in plant.control_names]
     return {

@@ -1,4 +1,4 @@
-"""An infinite horizon brought to a finite one, and its extremals back to the user's time."""
+"""A Problem on an infinite horizon mapped to a finite one, and its extremals mapped back."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,7 +16,10 @@ from jaxguide.types import is_traced
 
 
 class Endless(Wrapped):
-    """`inner`, whose horizon has no end, in s of [-1, 1): t = t0 + scale (1 + s)/(1 - s).
+    """`inner`, whose horizon is infinite, in s of [-1, 1): t = t0 + scale (1 + s)/(1 - s).
+
+    `scale`: the time from t0 to s = 0. `at_rest`: the state must vanish at the end, as `inner` says
+    nothing of it. `even`: dt/ds is that of the start at all s.
 
     **Source:** review, section 3 on infinite horizons, with the bilinear map.
     """
@@ -24,10 +27,10 @@ class Endless(Wrapped):
     scale: Float[Array, ""]
     start: Float[Array, ""]
     at_rest: bool = eqx.field(static=True)
-    even: bool = eqx.field(static=True, default=False)  # rates as at the start, all along
+    even: bool = eqx.field(static=True, default=False)
 
     def clock(self, s: Any) -> tuple[Any, Any]:
-        """t and dt/ds; at s = 1, where nothing moves any more, a rate of zero."""
+        """t and dt/ds; at s = 1, where t is infinite and the state rests, dt/ds counts as 0."""
         left = jnp.where(s < 1, 1 - s, 1.0)
         rate = jnp.where(s < 1, 2 * self.scale / left**2, 0.0)
         rate = jnp.full_like(rate, self.scale / 2) if self.even else rate
@@ -58,7 +61,7 @@ class Endless(Wrapped):
 
 
 def is_endless(problem: Problem) -> bool:
-    """Whether its final time is infinite, as far as can be seen."""
+    """Whether its final time is infinite; False where that is traced."""
     tf = problem.final_time
     return not is_free(tf) and not is_traced(tf) and bool(np.any(np.isinf(np.asarray(tf))))
 
@@ -70,7 +73,7 @@ def made_finite(problem: Problem, guess: Any, method: Any) -> tuple[Problem, Any
 
 
 def endless(problem: Problem, scale: Any) -> Problem:
-    """`problem`, whose final time is infinite, on [-1, 1]."""
+    """`problem`, whose final time is infinite, in s of [-1, 1]; `scale` in units of its time."""
     dtype = jnp.result_type(float)
     at_rest = endpoint_count(problem) == 0
     zero = jnp.zeros(problem.n, dtype)
@@ -89,8 +92,8 @@ def endless(problem: Problem, scale: Any) -> Problem:
 
 
 def evened(problem: Problem) -> Problem:
-    """`problem`, an endless horizon's clock running evenly: of the size that counts, where near the
-    end rates grow beyond all bounds."""
+    """`problem` with dt/ds of every `Endless` constant, as at its start: for sizes of quantities,
+    which dt/ds would otherwise make infinite towards the end."""
     if not isinstance(problem, Wrapped):
         return problem
     changed: dict[str, Any] = {"even": True} if isinstance(problem, Endless) else {}
@@ -98,7 +101,7 @@ def evened(problem: Problem) -> Problem:
 
 
 def opened(extremal: Extremal) -> Extremal:
-    """An extremal of an `Endless` problem, in the user's time: its last node is at t = inf."""
+    """An extremal of an `Endless` problem in the user's time, its last node at t = inf."""
     problem: Any = extremal.problem
     t = problem.clock(extremal.t)[0].at[-1].set(jnp.inf)
     rate = problem.clock(extremal.t)[1]
@@ -119,7 +122,7 @@ def opened(extremal: Extremal) -> Extremal:
 
 
 def closed(extremal: Extremal) -> Extremal:
-    """`opened` undone."""
+    """The inverse of `opened`: an extremal with its last node at t = inf, in s of [-1, 1]."""
     assert extremal.stretch is not None
     problem: Any = endless(extremal.problem, extremal.stretch)
     s = extremal.clock(extremal.t)

@@ -1,4 +1,4 @@
-"""Integral constraints as further states."""
+"""Integral constraints as further states: an integral starts at zero and grows by its integrand."""
 
 import math
 from typing import Any
@@ -8,15 +8,19 @@ from jaxtyping import Array
 
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import Problem, count, endpoint_count, initial_entries
-from jaxguide.transforms.wrapped import Wrapped, own_fields
+from jaxguide.transforms.wrapped import Wrapped, own_fields, rewrapped
 
 
 def joined_bounds(a: tuple, b: tuple) -> tuple[Array, Array]:
+    """Bounds of the components of `a` and, after them, those of `b`."""
     return jnp.concatenate([a[0], b[0]]), jnp.concatenate([a[1], b[1]])
 
 
 class WithIntegrals(Wrapped):
     """`inner` with each of its integrals as a state that starts at zero and ends within bounds."""
+
+    def around(self, problem: Problem) -> Problem:
+        return with_integrals(rewrapped(self.inner, problem))
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         x = x[: self.inner.n]
@@ -41,7 +45,7 @@ class WithIntegrals(Wrapped):
 
 
 def with_integrals(problem: Problem) -> Problem:
-    """`problem`, or a WithIntegrals of it where it has integral constraints."""
+    """`problem` with its integral constraints as states; `problem` itself if it has none."""
     dtype, r = jnp.result_type(float), count(problem, "integrands")
     if not r:
         return problem

@@ -1,4 +1,4 @@
-"""`jg.Phased`: problems one after another, linked, as one Problem on a common clock."""
+"""`jg.Phased`: Problems that follow each other in time, as one Problem."""
 
 import dataclasses
 import inspect
@@ -23,7 +23,7 @@ from jaxguide.problem import (
     start_value,
 )
 from jaxguide.trajectory import Extremal, Multipliers
-from jaxguide.transforms.wrapped import FIELDS, Wrapped, own_fields
+from jaxguide.transforms.wrapped import Wrapped, own_fields, restated
 from jaxguide.types import is_traced
 
 
@@ -37,7 +37,7 @@ class PhaseEnds(NamedTuple):
 
 
 class Linked(Wrapped):
-    """A phase whose end is given by what follows it."""
+    """A phase whose final state is given: that at which the next phase starts."""
 
     def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
         return xf
@@ -51,13 +51,13 @@ class Phased(Problem):
     Problem like any other: review, eq. (2) and section 4 on knots.
 
     **Arguments:** `phases`: Problems; each starts when the one before ends, at its `final_time` (a
-    number or `jg.Free`), and only the first one's `initial_time` counts. States of later phases
-    are free at their start unless their `initial_state` says otherwise. `links(ends)`: what must
-    vanish, (r,), from one `PhaseEnds` a phase; default: the state is continuous. A function, or an
-    `equinox.Module` whose leaves (the jump, say) are then differentiable.
+    number or `jg.Free`), and only the first one's `initial_time` counts. A later phase's
+    `initial_state` may be None: the links then give it. `links(ends)`: (r,) numbers that must
+    vanish, from a `PhaseEnds` for each phase; default: the state is continuous. A function, or an
+    `equinox.Module`, whose leaves (such as the size of a jump) are then differentiable.
 
-    Names, bounds and initial entries are those of the phases: edit them there, by
-    `equinox.tree_at` or with new phases.
+    Names, times, bounds and initial entries are properties that follow from the phases: edit the
+    phases, by `equinox.tree_at` or with new ones.
 
     **Raises:** `ValueError` if phases that should be continuous have other states, times do not
     ascend, or a phase has no end.
@@ -73,7 +73,10 @@ class Phased(Problem):
         self.check_statement()
 
     def check_statement(self) -> None:
-        """Refuses phases that cannot follow each other. Also asked by `solve`."""
+        """Refuses phases that cannot follow each other; `solve` asks as well.
+
+        **Raises:** `ValueError`.
+        """
         phases, links = self.phases, self.links
         if len(phases) < 2:
             raise ValueError(f"Phased: {len(phases)} phases; give at least two.")
@@ -88,9 +91,9 @@ class Phased(Problem):
             earliest, latest = a.lo if is_free(a) else a, b.hi if is_free(b) else b
             if not is_traced((earliest, latest)) and not float(latest) > float(earliest):
                 raise ValueError(
-                    f"Phased: phase {i + 1}, {type(phase).__name__}, starts at {_said(a)} and ends "
-                    f"at {_said(b)}; times must ascend. A phase starts at the final_time of the "
-                    "one before."
+                    f"Phased: phase {i + 1}, {type(phase).__name__}, starts at {_as_text(a)} and "
+                    f"ends at {_as_text(b)}; times must ascend. A phase starts at the final_time "
+                    "of the one before."
                 )
         for a, b in zip(phases[:-1], phases[1:], strict=True):
             if links is None and a.state_names != b.state_names:
@@ -168,18 +171,20 @@ class Phased(Problem):
         return tuple(paths)
 
     def horizons(self) -> list[tuple[Any, Any]]:
-        """(t0, tf) of each phase."""
+        """(t0, tf) of each phase, in the phases' unit of time; `Free` where the solver chooses."""
         times = [self.phases[0].initial_time, *(p.final_time for p in self.phases)]
         return list(zip(times[:-1], times[1:], strict=True))
 
     def split_state(self, x: Array) -> list[Array]:
+        """The states of each phase, from the last axis of `x`."""
         return jnp.split(x, np.cumsum([p.n for p in self.phases])[:-1], axis=-1)
 
     def split_control(self, u: Array) -> list[Array]:
+        """The controls of each phase, from the last axis of `u`."""
         return jnp.split(u, np.cumsum([p.m for p in self.phases])[:-1], axis=-1)
 
     def _each(self, tau: Any, x: Any, u: Any) -> list[tuple]:
-        """(phase, its duration, its own t, x, u)."""
+        """(phase, duration, t, x, u) of each phase at `tau`."""
         parts = zip(
             self.phases, self.horizons(), self.split_state(x), self.split_control(u), strict=True
         )
@@ -216,15 +221,15 @@ class Phased(Problem):
         return sum(p.endpoint_cost(*end) for p, end in zip(self.phases, ends, strict=True))
 
     def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
-        """The phases' own, the links, and durations, which may not be negative."""
+        """The phases' own constraints, the links, and the durations, which may not be negative."""
         ends = self._ends(x0, xf)
         own = [p.endpoint_constraints(*end) for p, end in zip(self.phases, ends, strict=True)]
         durations = jnp.stack([end.tf - end.t0 for end in ends])
         return jnp.concatenate([*own, self._links(ends), durations])
 
     def split(self, extremal: Extremal) -> tuple[Extremal, ...]:
-        """The phases' own extremals, each in its own time, from and (but for the last) to the
-        states it has at its ends: `Linked`. Durations must be positive."""
+        """An extremal of each phase in its own time, between the states it has at its ends; the
+        end of the last is as stated. Durations must be positive."""
         problem = extremal.problem
         assert isinstance(problem, Phased)
         none: Any = [None] * len(self.phases)
@@ -244,11 +249,10 @@ class Phased(Problem):
                 per_control(m.control)[i] / span, integral[i],
             )  # fmt: skip
             x, costate = per_state(extremal.x)[i], per_state(extremal.costate)[i]
-            phase = dataclasses.replace(
-                phase, initial_time=t0, final_time=tf, initial_state=tuple(x[0])
-            )
+            phase = restated(phase, initial_time=t0, final_time=tf, initial_state=tuple(x[0]))
             if i + 1 < len(problem.phases):
-                # What follows pulls at its end as much as if its state were given there.
+                # The multiplier of the given final state: transversality, 2002 paper, eq. (8) with
+                # the sign of `Extremal`.
                 pull = jax.grad(phase.endpoint_cost, argnums=1)(x[0], x[-1], t0, tf)
                 covectors = dataclasses.replace(covectors, endpoint=costate[-1] - pull)
                 phase = Linked(phase, **own_fields(phase, endpoint_bounds=(x[-1], x[-1])))
@@ -269,7 +273,8 @@ def _join(pairs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
-    """Initial entries; one free without a guess starts where the state of its name did before."""
+    """Initial entries of all phases. One that is free without a guess gets as its guess the start
+    of the state of the same name in the phase before."""
     seen: dict[str, Any] = {}
     out = []
     for phase in phases:
@@ -281,10 +286,5 @@ def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
     return tuple(out)
 
 
-def _said(time: Any) -> str:
+def _as_text(time: Any) -> str:
     return f"[{time.lo}, {time.hi}]" if is_free(time) else str(time)
-
-
-# What follows from the phases is no field: dataclasses.replace may not set it.
-for _name in FIELDS:
-    del Phased.__dataclass_fields__[_name]

@@ -1,4 +1,5 @@
-"""Relaxed dynamics: what a low grid may miss them by (review, problem B^N and Theorem 2)."""
+"""Dynamics met to within a tolerance, without which a low grid may have no solution: review,
+problem B^N and Theorem 2."""
 
 from typing import Any
 
@@ -6,24 +7,19 @@ from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import Problem
-from jaxguide.transforms.integrals import WithIntegrals, joined_bounds, with_integrals
-from jaxguide.transforms.wrapped import Wrapped, own_fields
-
-
-def rewrapped(whole: Problem, problem: Problem) -> Problem:
-    """`whole` around `problem` itself, whose derivatives count."""
-    if type(whole) not in (WithIntegrals, Relaxed):
-        return problem
-    assert isinstance(whole, Wrapped)
-    inner = rewrapped(whole.inner, problem)
-    if isinstance(whole, WithIntegrals):
-        return with_integrals(inner)
-    return relaxed(inner, whole.control_bounds[1][inner.m :])
+from jaxguide.transforms.integrals import joined_bounds
+from jaxguide.transforms.wrapped import Wrapped, own_fields, rewrapped
 
 
 class Relaxed(Wrapped):
-    """`inner` whose dynamics may be missed by its last n controls: the consistency relaxation
-    |dx/dt - f| <= delta at the nodes. Review, problem B^N and Theorem 2."""
+    """`inner` with n further controls, the slacks s of |s| <= delta: dx/dt = f + s.
+
+    **Source:** review, problem B^N and Theorem 2: the relaxation |dx/dt - f| <= delta at the nodes.
+    """
+
+    def around(self, problem: Problem) -> Problem:
+        inner = rewrapped(self.inner, problem)
+        return relaxed(inner, self.control_bounds[1][inner.m :])
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         return self.inner.dynamics(t, x, u[: self.inner.m]) + u[self.inner.m :]
@@ -39,7 +35,7 @@ class Relaxed(Wrapped):
 
 
 def relaxed(problem: Problem, delta: Float[Array, " n"]) -> Problem:
-    """`problem` with its dynamics met to within `delta`, in units of state per time."""
+    """`problem` with its dynamics met to within `delta` (n,), in units of state per time."""
     own = bounds_of(problem.control_bounds, problem.m, delta.dtype)
     return Relaxed(
         inner=problem,

@@ -1,4 +1,5 @@
-"""A Problem told by one of its states instead of time: Nowack's horizontal velocity, say."""
+"""A Problem with one of its states as independent variable in place of time, such as the
+horizontal velocity of the lunar launch (thesis)."""
 
 from typing import Any
 
@@ -15,12 +16,12 @@ class StateAsTime(Problem):
     """`problem` with the state `name` as independent variable; time becomes the last state.
 
     dx/ds = f/f_s and dt/ds = 1/f_s, where f_s is the rate of that state; costs and constraints are
-    those of `problem`. The horizon runs from the state's initial to its final value, which is free
-    and for the endpoint constraints to fix. Where f_s has not the sign it had along the nominal,
-    rates are NaN: such a flight ends as `diverged` and never runs backwards in time.
+    those of `problem`. The horizon runs from the state's initial to its final value, which is free:
+    endpoint constraints fix it. Where f_s has another sign than along the nominal, rates are NaN:
+    such a flight ends as `diverged` and never runs backwards in time.
 
-    **Arguments:** `nominal`: an Extremal of `problem`, which tells whether the state is monotone,
-    which way it runs, and how far.
+    **Arguments:** `nominal`: an Extremal of `problem`, along which the state must be monotone; it
+    gives the direction, and the guess of the final value.
 
     **Raises:** `ValueError` for an unknown state, or one that is not monotone along the nominal.
     """
@@ -61,34 +62,34 @@ class StateAsTime(Problem):
         self.endpoint_bounds, self.path_bounds = problem.endpoint_bounds, problem.path_bounds
         self.integral_bounds = problem.integral_bounds
 
-    def told_by_time(self, s: Any, y: Any) -> tuple[Any, Any]:
-        """Time and state of `problem`, from what stands for them here."""
+    def in_time(self, s: Any, y: Any) -> tuple[Any, Any]:
+        """Time and state of `problem`, from the independent variable and state here."""
         i = self.problem.state_names.index(self.name)
         s = jnp.asarray(s, y.dtype)
         return y[-1], jnp.concatenate([y[:i], s[None], y[i:-1]])
 
     def dynamics(self, t: Any, x: Any, u: Any) -> Any:
         i = self.problem.state_names.index(self.name)
-        time, state = self.told_by_time(t, x)
+        time, state = self.in_time(t, x)
         f = self.problem.dynamics(time, state, u)
         rate = self._checked(f[i])
         return jnp.concatenate([f[:i], f[i + 1 :], jnp.ones_like(f[:1])]) / rate
 
     def running_cost(self, t: Any, x: Any, u: Any) -> Any:
         i = self.problem.state_names.index(self.name)
-        time, state = self.told_by_time(t, x)
+        time, state = self.in_time(t, x)
         rate = self._checked(self.problem.dynamics(time, state, u)[i])
         return self.problem.running_cost(time, state, u) / rate
 
     def path_constraints(self, t: Any, x: Any, u: Any) -> Any:
-        return self.problem.path_constraints(*self.told_by_time(t, x), u)
+        return self.problem.path_constraints(*self.in_time(t, x), u)
 
     def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
-        (a, x0), (b, xf) = self.told_by_time(t0, x0), self.told_by_time(tf, xf)
+        (a, x0), (b, xf) = self.in_time(t0, x0), self.in_time(tf, xf)
         return self.problem.endpoint_cost(x0, xf, a, b)
 
     def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
-        (a, x0), (b, xf) = self.told_by_time(t0, x0), self.told_by_time(tf, xf)
+        (a, x0), (b, xf) = self.in_time(t0, x0), self.in_time(tf, xf)
         return self.problem.endpoint_constraints(x0, xf, a, b)
 
     def _checked(self, rate: Any) -> Any:

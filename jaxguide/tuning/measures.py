@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import overstep
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, sample_times
 
@@ -19,10 +19,8 @@ def endpoint_miss(mission: Mission, flight: Flight) -> Float[Array, ""]:
     plant = mission.plant
     at = (mission.initial_state, flight.final_state, mission.initial_time, flight.final_time)
     e = plant.endpoint_constraints(*at)
-    lo, hi = bounds_of(plant.endpoint_bounds, e.shape[0], e.dtype)
-    off = jnp.maximum(lo - e, 0.0) + jnp.maximum(e - hi, 0.0)
-    squares = jnp.sum(off**2)
-    # The derivative of the root at zero is set to zero.
+    squares = jnp.sum(overstep(e, plant.endpoint_bounds) ** 2)
+    # The root's derivative at zero is taken as zero.
     return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
 
 

@@ -33,7 +33,8 @@ from jaxguide.spectral import NodeFamily, node_family
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import Endless
 from jaxguide.transforms.integrals import with_integrals
-from jaxguide.transforms.relaxed import relaxed, rewrapped
+from jaxguide.transforms.relaxed import relaxed
+from jaxguide.transforms.wrapped import rewrapped
 from jaxguide.types import RESULTS, is_traced
 
 _MOST_NODES = 512

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial.legendre import legval, legvander
 
+from jaxguide.neighboring.breaks import place_breaks
 from jaxguide.neighboring.linearization import LinearTPBVP, linearize
-from jaxguide.neighboring.segmented import collocate, place_breaks
+from jaxguide.neighboring.sweep import collocate
 from jaxguide.reproduce.earth_mars.published import GAINS_EXACT
 from jaxguide.spectral import nodes_lg, nodes_lgl
 from jaxguide.trajectory import Extremal, Point
