@@ -60,6 +60,7 @@ ORDER: dict[str, tuple[str, ...]] = {
     "nominal": (
         "steps",
         "roots",
+        "ends",
         "starts",
         "defects",
         "method",

@@ -1,6 +1,7 @@
 """Direct solutions: the Newton step against dense algebra, closed forms, covectors, failures."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -353,8 +354,9 @@ def test_a_start_outside_its_bounds_is_refused(start):
 
 
 def test_a_method_is_an_instance():
+    method: Any = jg.Pseudospectral
     with pytest.raises(ValueError, match=r"give an instance, such as jg.Pseudospectral\(\)"):
-        jg.solve(DoubleIntegrator(), cast(Any, jg.Pseudospectral))
+        jg.solve(DoubleIntegrator(), method)
 
 
 class Undefined(DoubleIntegrator):

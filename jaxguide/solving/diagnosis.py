@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.bounds import bounds_of
-from jaxguide.problem import Problem, initially_free
-from jaxguide.spectral import differentiation_matrix
+from jaxguide.bounds import bounds_of, overstep
+from jaxguide.nominal.defects import defects
+from jaxguide.problem import initially_free
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS
 
@@ -78,61 +78,60 @@ def _first_undefined(values: Any) -> tuple[int, int, float] | None:
 
 
 def _misses(extremal: Extremal) -> list[tuple[float, str]]:
-    """(relative size, sentence) of the worst of each kind of constraint."""
-    problem, t = extremal.problem, np.asarray(extremal.t)
-    x, u = np.asarray(extremal.x), np.asarray(extremal.u)
+    """The worst of each kind of constraint: its error relative to its size, and a sentence."""
+    problem, t, size = extremal.problem, np.asarray(extremal.t), _sizes(extremal)
     out = []
-    e = np.asarray(problem.endpoint_constraints(extremal.x[0], extremal.x[-1], t[0], t[-1]))
-    lo, hi = _sides(problem.endpoint_bounds, len(e))
-    miss = np.maximum(lo - e, 0) + np.maximum(e - hi, 0)
+    e = problem.endpoint_constraints(extremal.x[0], extremal.x[-1], t[0], t[-1])
     if len(e):
-        i = int(np.argmax(miss / _size(lo, hi, e)))
+        lo, hi = _sides(problem.endpoint_bounds, len(e))
+        miss = np.asarray(overstep(e, problem.endpoint_bounds))
+        i = int(np.argmax(miss / size.end))
         out.append(
             (
-                float((miss / _size(lo, hi, e))[i]),
-                f"Endpoint constraint {i} misses its bounds by {miss[i]:.3g} (value {e[i]:.6g}, "
-                f"bounds [{lo[i]:g}, {hi[i]:g}]); if it contradicts another or lies out of reach, "
-                "relax it.",
+                float((miss / size.end)[i]),
+                f"Endpoint constraint {i} misses its bounds by {miss[i]:.3g} (value "
+                f"{float(e[i]):.6g}, bounds [{lo[i]:g}, {hi[i]:g}]); if it contradicts another or "
+                "lies out of reach, relax it.",
             )
         )
-    h = np.asarray(jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u))
-    for what, names, values, bounds in (
-        ("State", problem.state_names, x, problem.state_bounds),
-        ("Control", problem.control_names, u, problem.control_bounds),
-        ("Path constraint", [str(i) for i in range(h.shape[1])], h, problem.path_bounds),
-    ):
+    h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
+    paths = [str(i) for i in range(h.shape[1])]
+    kinds: Any = (
+        ("State", problem.state_names, extremal.x, problem.state_bounds, size.x),
+        ("Control", problem.control_names, extremal.u, problem.control_bounds, size.u),
+        ("Path constraint", paths, h, problem.path_bounds, size.path),
+    )
+    for what, names, values, bounds, of in kinds:
         if not values.shape[1]:
             continue
         lo, hi = _sides(bounds, values.shape[1])
-        miss = np.maximum(lo - values, 0) + np.maximum(values - hi, 0)
-        relative = miss / _size(lo, hi, np.abs(values).max(axis=0))
+        miss = np.asarray(overstep(values, bounds))
+        relative = miss / of
         k, i = np.unravel_index(int(np.argmax(relative)), relative.shape)
         out.append(
             (
                 float(relative[k, i]),
-                f"{what} {names[i]} is {values[k, i]:.6g} at node {k} (t = {t[k]:.6g}), outside "
-                f"[{lo[i]:g}, {hi[i]:g}] by {miss[k, i]:.3g}; widen its bounds or free the time.",
+                f"{what} {names[i]} is {float(values[k, i]):.6g} at node {k} (t = {t[k]:.6g}), "
+                f"outside [{lo[i]:g}, {hi[i]:g}] by {miss[k, i]:.3g}; widen its bounds or free the "
+                "time.",
             )
         )
-    out.append(_defect(extremal, problem, t))
+    out.append(_worst_defect(extremal, size))
     return out
 
 
-def _defect(extremal: Extremal, problem: Problem, t: np.ndarray) -> tuple[float, str]:
-    D = differentiation_matrix(extremal.reference_nodes)
+def _worst_defect(extremal: Extremal, size: Any) -> tuple[float, str]:
+    """Where the dynamics are missed most at the nodes, over a segment."""
+    problem, times = extremal.problem, extremal.by_segment(extremal.t[:, None])[..., 0]
     half = jnp.diff(extremal.breaks) / 2
-    parts = extremal.by_segment(extremal.x)
-    rate = jnp.einsum("kp,spn->skn", D, parts)
-    u = extremal.control_by_segment()
-    times = extremal.by_segment(extremal.t[:, None])[..., 0]
-    f = jax.vmap(jax.vmap(problem.dynamics))(times, parts, u) * half[:, None, None]
-    gap = np.array(jnp.abs(rate - f))
+    gap = defects(extremal, extremal.reference_nodes) * half[:, None, None]
+    gap = np.array(jnp.abs(gap))
     gap[:, 0] = 0.0  # no node of Radau's grid
     gap[~np.isfinite(gap)] = 0.0
-    span = np.abs(np.asarray(extremal.x)).max(axis=0) + 1e-3
-    s, k, i = np.unravel_index(int(np.argmax(gap / span)), gap.shape)
+    relative = gap / size.x
+    s, k, i = np.unravel_index(int(np.argmax(relative)), gap.shape)
     free = initially_free(problem)
-    return float(gap[s, k, i] / span[i]), (
+    return float(relative[s, k, i]), (
         f"The dynamics of {problem.state_names[i]} are missed by {gap[s, k, i]:.3g} over segment "
         f"{s} (t = {float(times[s, k]):.6g}); the constraints leave no control that follows them: "
         f"relax one{'' if any(free) else ', free a component of the initial state'} or the time."
@@ -140,10 +139,12 @@ def _defect(extremal: Extremal, problem: Problem, t: np.ndarray) -> tuple[float,
 
 
 def _sides(bounds: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds, (size,) each."""
     lo, hi = bounds_of(bounds, size, jnp.result_type(float))
     return np.asarray(lo), np.asarray(hi)
 
 
-def _size(lo: np.ndarray, hi: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    finite = lambda b: np.where(np.isfinite(b), np.abs(b), 0.0)
-    return np.maximum(np.maximum(finite(lo), finite(hi)), 1e-3 + 0 * np.abs(seen))
+def _sizes(extremal: Extremal) -> Any:
+    """Sizes along the last iterate as NumPy's arrays, 1 where they are not finite."""
+    usable = lambda a: np.where(np.isfinite(np.asarray(a)), a, 1.0)
+    return jax.tree_util.tree_map(usable, jax.jit(Extremal.sizes)(extremal))

@@ -3,7 +3,7 @@
 import dataclasses
 import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,6 +25,8 @@ from jaxguide.problem import (
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.transforms.wrapped import Wrapped, own_fields, restated
 from jaxguide.types import is_traced
+
+Kind = TypeVar("Kind", bound=Extremal)  # with its certificate, or without
 
 
 class PhaseEnds(NamedTuple):
@@ -227,7 +229,7 @@ class Phased(Problem):
         durations = jnp.stack([end.tf - end.t0 for end in ends])
         return jnp.concatenate([*own, self._links(ends), durations])
 
-    def split(self, extremal: Extremal) -> tuple[Extremal, ...]:
+    def split(self, extremal: Kind) -> tuple[Kind, ...]:
         """An extremal of each phase in its own time, between the states it has at its ends; the
         end of the last is as stated. Durations must be positive."""
         problem = extremal.problem

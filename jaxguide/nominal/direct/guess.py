@@ -1,6 +1,6 @@
 """The guess that a direct solve starts from: straight, random or from an extremal."""
 
-from typing import Any
+import math
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import bounds_of
-from jaxguide.conditions.units import REST, known_size, natural_units
-from jaxguide.linalg import gauss_solve
+from jaxguide.conditions.units import REST, natural_units
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
+from jaxguide.nominal.ends import horizon_guess, nearest_ends
+from jaxguide.nominal.starts import UNBOUNDED, bounds_middle, control_ends, drawn_final_time
 from jaxguide.problem import (
     Problem,
-    initial_values,
     initially_free,
     is_free,
     parameters,
@@ -28,9 +28,7 @@ from jaxguide.transforms.endless import evened
 # Constant controls that are tried where states rest, from the middle of a control's range and as
 # shares of it: chosen for the brachistochrone, whose start is singular at rest.
 _SHARES = (0.0, -0.25, 0.25)
-# Newton steps towards ends that meet the endpoint constraints, and the ridge that keeps redundant
-# constraints solvable. Choices: a guess need be no better.
-_END_STEPS, _RIDGE = 8, 1e-8
+_SPREAD = math.log(2)  # of a random horizon: within a factor of two of the guess
 
 
 def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
@@ -47,27 +45,6 @@ def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Arr
     return out.at[j, column[left]].add(1 - share).at[j, column[left + 1]].add(share)
 
 
-def horizon_guess(problem: Problem) -> tuple[Array, Array]:
-    """t0 and tf, in user units: given, guessed, or one unit apart where neither is."""
-    dtype = jnp.result_type(float)
-    number = lambda v: jnp.asarray(v, dtype)
-    start, end = problem.initial_time, problem.final_time
-    t0 = number(start_value(start))
-    if not is_free(end) or end.guess is not None:
-        tf = number(start_value(end))
-    else:
-        lo, hi = number(end.lo), number(end.hi)
-        bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
-        tf = jnp.where(bounded, start_value(end), jnp.clip(t0 + 1.0, lo, hi))
-    # A time that is not given makes way for one that is.
-    halfway = lambda a, b, other: jnp.where(jnp.isfinite(b), (a + b) / 2, other)
-    if is_free(end) and end.guess is None:
-        tf = jnp.where(tf > t0, tf, halfway(t0, number(end.hi), t0 + 1.0))
-    if is_free(start) and start.guess is None:
-        t0 = jnp.where(tf > t0, t0, halfway(tf, number(start.lo), tf - 1.0))
-    return t0, tf
-
-
 def straight_guess(
     program: Transcription, fractions: Float[Array, " edge"], knots: tuple[int, ...]
 ) -> Primal:
@@ -76,7 +53,7 @@ def straight_guess(
     problem, counts = with_parameters(program.problem, None), program.counts
     dtype, n = program.dtype, counts.n
     t0, tf = horizon_guess(program.problem)
-    x0, xf = _nearest_ends(program, t0, tf)
+    x0, xf = nearest_ends(program.problem, t0, tf)
     u = start_control(program.problem, dtype)
     s = fractions_at(fractions, program.rule.support[1:])
     x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
@@ -102,40 +79,6 @@ def _endpoint_count(program: Transcription) -> int:
 
 def _natural_units(program: Transcription, w: Primal) -> tuple[Array, Array]:
     return natural_units(evened(program.problem), w.times, w.x0, w.x, w.u)
-
-
-def _nearest_ends(program: Transcription, t0: Array, tf: Array) -> tuple[Array, Array]:
-    """Initial and final states near the initial one that meet the endpoint constraints, by Newton's
-    method with least steps, in units of each state's size."""
-    problem, dtype, n = with_parameters(program.problem, None), program.dtype, program.counts.n
-    lo, hi = bounds_of(program.problem.state_bounds, n, dtype)
-    x0 = jnp.clip(initial_values(program.problem, dtype), lo, hi)
-    q = _endpoint_count(program)
-    e_lo, e_hi = bounds_of(program.problem.endpoint_bounds, q, dtype)
-    known = known_size(lo, hi, x0[None])
-    scale = jnp.tile(jnp.where(known > 0, known, 1.0), 2)
-    # Free components of the initial state move with the final ones.
-    free = jnp.concatenate([jnp.asarray(initially_free(program.problem)), jnp.ones(n, bool)])
-    scale = jnp.where(free, scale, 0.0)
-    low, high = jnp.tile(lo, 2), jnp.tile(hi, 2)
-
-    def nearer(_: Any, ends: Array) -> Array:
-        def at(y: Array) -> Array:
-            moved = ends + y * scale
-            return problem.endpoint_constraints(moved[:n], moved[n:], t0, tf)
-
-        e, J = at(jnp.zeros_like(ends)), jax.jacfwd(at)(jnp.zeros_like(ends))
-        # By rows of one size, lest the ridge drown those of small units.
-        size = jnp.linalg.norm(J, axis=1)
-        size = jnp.where(size > 0, size, 1.0)
-        miss, J = (e - jnp.clip(e, e_lo, e_hi)) / size, J / size[:, None]
-        step = J.T @ gauss_solve(J @ J.T + _RIDGE * q * jnp.eye(q, dtype=dtype), miss)
-        step = jnp.where(jnp.isfinite(step), step, 0.0)
-        return jnp.where(free, jnp.clip(ends - scale * step, low, high), ends)
-
-    ends = jnp.tile(x0, 2)
-    ends = jax.lax.fori_loop(0, _END_STEPS, nearer, ends) if q else ends
-    return ends[:n], ends[n:]
 
 
 def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> Primal:
@@ -191,18 +134,15 @@ def random_guess(
     bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
     x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])
     u_lo, u_hi = bounds_of(program.problem.control_bounds, counts.m, dtype)
-    bounded = jnp.isfinite(u_lo) & jnp.isfinite(u_hi)
-    middle = jnp.where(bounded, (u_lo + u_hi) / 2, 0.0)
-    half = jnp.where(bounded, (u_hi - u_lo) / 2, 3.0 * of_u)
-    ends = middle[None] + half[None] * jax.random.uniform(k_u, (2, counts.m), dtype, -1.0, 1.0)
+    draws = jax.random.uniform(k_u, (2, counts.m), dtype, -1.0, 1.0)
+    centre = bounds_middle(program.problem, dtype)
+    ends = control_ends(program.problem, draws, centre, UNBOUNDED * of_u)
     ends = jnp.clip(ends, u_lo[None], u_hi[None])
     s = fractions_at(fractions, rule.nodes)[..., None]
     u = ends[0][None, None] * (1 - s) + ends[1][None, None] * s
-    tf = program.problem.final_time
     times = w.times
-    if is_free(tf):
-        span = (times[1] - times[0]) * 2 ** jax.random.uniform(k_t, (), dtype, -1.0, 1.0)
-        end = jnp.clip(times[0] + span, jnp.asarray(tf.lo, dtype), jnp.asarray(tf.hi, dtype))
+    if is_free(program.problem.final_time):
+        end = drawn_final_time(program.problem, k_t, times[0], times[1], _SPREAD)
         times = placed(times[0], end, fractions, knots)
     return w._replace(x=x, u=u, times=times)
 

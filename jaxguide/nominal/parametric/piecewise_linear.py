@@ -9,11 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import bounds_of, positive
+from jaxguide.conditions.bounded import bounded
+from jaxguide.conditions.units import natural_units
+from jaxguide.nominal.ends import nearest_ends
 from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, minimise, polished, residual
 from jaxguide.nominal.parametric.extremal import flown
+from jaxguide.nominal.starts import control_ends
 from jaxguide.problem import (
     Problem,
     count,
@@ -26,8 +30,13 @@ from jaxguide.problem import (
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, is_traced
 
-_ITERATIONS = 100
-_TOLERANCE = 1e-12  # scaled KKT residual up to which a solution counts as converged
+_ITERATIONS = 100  # of Newton from one start: a choice, far more than a good start takes
+# Scaled KKT residual up to which a solution counts as converged, and a start before it is polished.
+_TOLERANCE, _FOUND = 1e-12, 1e-6
+_WITHIN = 1e-9  # by how much, of its size, a bound may be overstepped
+# Random starts: half the range of a control without bounds, in its units; a horizon within twice
+# the guess (log 2 = 0.7). Choices.
+_HALF, _SPREAD = 1.0, 0.7
 
 
 class PiecewiseLinear(Method):
@@ -116,11 +125,12 @@ class PiecewiseLinear(Method):
 
     def __call__(self, problem: Problem, guess: Any) -> Extremal:
         frozen, positions = jax.lax.stop_gradient((problem, self.positions))
+        of_u = _control_units(frozen)
         if guess is None:
-            begin = _starts(problem, positions, self.starts, self.seed)
+            begin = _starts(frozen, positions, of_u, self.starts, self.seed)
         else:
             begin = jax.lax.stop_gradient(self._from_guess(frozen, positions, guess))[None]
-        units = jax.vmap(functools.partial(_units, frozen, positions, self.degree))(begin)
+        units = jax.vmap(functools.partial(_units, frozen, positions, of_u, self.degree))(begin)
 
         def attempt(a: Array, units: Units) -> tuple[KKTPoint, Array, Array, Array]:
             args = (frozen, positions)
@@ -128,7 +138,7 @@ class PiecewiseLinear(Method):
             return *found, self._values(units)(found[0].a, args)[0] * units.f
 
         zs, errors, minimal, costs = jax.lax.stop_gradient(jax.vmap(attempt)(begin, units))
-        converged = (errors < 1e-6) & jnp.isfinite(costs)
+        converged = (errors < _FOUND) & jnp.isfinite(costs)
         cheapest = jnp.argmin(jnp.where(converged, costs, jnp.inf))
         best = jnp.where(jnp.any(converged), cheapest, jnp.argmin(errors))
         z, units = jax.tree_util.tree_map(lambda v: v[best], (zs, units))
@@ -181,45 +191,57 @@ class Units(NamedTuple):
     c: Float[Array, " q"]
 
 
-def _units(problem: Problem, positions: Array, degree: int, a: Array) -> Units:
-    """The final time by its own size, controls by one; the rest by their gradients there."""
-    size = jnp.ones_like(a)
+def _control_units(problem: Problem) -> Float[Array, " m"]:
+    """What a control amounts to, by its bounds or, far from 1, by what its motion must achieve."""
+    dtype = jnp.result_type(float)
+    t0 = jnp.asarray(problem.initial_time, dtype)
+    tf = jnp.asarray(start_value(problem.final_time), dtype)
+    x0, xf = nearest_ends(problem, t0, tf)
+    u = start_control(problem, dtype)[None, None]
+    return natural_units(problem, jnp.stack([t0, tf]), x0, xf[None, None], u)[1]
+
+
+def _units(
+    problem: Problem, positions: Array, of_u: Float[Array, " m"], degree: int, a: Array
+) -> Units:
+    """The final time by its own value, controls without bounds by `of_u`, the others by one; cost
+    and constraints by their gradients there."""
+    lo, hi = bounds_of(problem.control_bounds, problem.m, a.dtype)
+    of_u = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), 1.0, of_u)
+    size = jnp.tile(of_u, positions.shape[0])
     if is_free(problem.final_time):
-        size = size.at[-1].set(jnp.maximum(jnp.abs(a[-1]), 1e-8))
+        size = jnp.append(size, positive(jnp.abs(a[-1])))
     start = par.from_the_start(problem, a.dtype)
     outcome = lambda a: par.outcome(problem, positions, a * size, start, degree)[:2]
     f, c = jax.jacfwd(outcome)(a / size)
-    usable = lambda s: jnp.where(jnp.isfinite(s) & (s > 1e-8), s, 1.0)
+    usable = lambda s: jnp.where(jnp.isfinite(s) & (s > 0), s, 1.0)
     return Units(size, usable(jnp.max(jnp.abs(f))), usable(jnp.max(jnp.abs(c), axis=1)))
 
 
-def _starts(problem: Problem, positions: Array, starts: int, seed: int) -> Float[Array, "start p"]:
+def _starts(
+    problem: Problem, positions: Array, of_u: Float[Array, " m"], starts: int, seed: int
+) -> Float[Array, "start p"]:
     """A constant control, then random straight ones over horizons within twice the guess."""
     dtype, m = positions.dtype, problem.m
     k_u, k_t = jax.random.split(jax.random.key(seed))
+    draws = jax.random.uniform(k_u, (starts, 2, m), dtype, -1.0, 1.0).at[0].set(0.0)
     lo, hi = bounds_of(problem.control_bounds, m, dtype)
-    finite = jnp.isfinite(lo) & jnp.isfinite(hi)
-    half = jnp.where(finite, (hi - lo) / 2, 1.0)
-    ends = jax.random.uniform(k_u, (starts, 2, m), dtype, -1.0, 1.0).at[0].set(0.0)
-    ends = start_control(problem, dtype)[None, None] + half[None, None] * ends
+    middle, start = jnp.clip(0.0, lo, hi), start_control(problem, dtype)
+    unbounded = ~(jnp.isfinite(lo) & jnp.isfinite(hi))
+    centre = jnp.where(unbounded, middle + (start - middle) * of_u, start)
+    ends = control_ends(problem, draws, centre, _HALF * of_u)
     controls = ends[:, :1] + positions[None, :, None] * (ends[:, 1:] - ends[:, :1])
     t0 = jnp.asarray(problem.initial_time, dtype)
     tf = jnp.asarray(start_value(problem.final_time), dtype)
-    factor = jnp.exp(jax.random.uniform(k_t, (starts,), dtype, -0.7, 0.7)).at[0].set(1.0)
+    factor = jnp.exp(jax.random.uniform(k_t, (starts,), dtype, -_SPREAD, _SPREAD)).at[0].set(1.0)
     return jax.vmap(lambda u, s: par.pack(problem, u, t0 + s * (tf - t0)))(controls, factor)
 
 
 def _within_bounds(extremal: Extremal) -> Array:
     """Whether state and control keep within their bounds, which are not enforced."""
-    problem, slack = extremal.problem, 1e-9
-    inside = []
-    for values, bounds in (
-        (extremal.x, problem.state_bounds),
-        (extremal.u, problem.control_bounds),
-    ):
-        lo, hi = bounds_of(bounds, values.shape[1], values.dtype)
-        inside.append(jnp.all((values >= lo[None] - slack) & (values <= hi[None] + slack)))
-    return inside[0] & inside[1]
+    e, m = extremal, extremal.multipliers
+    over = bounded(e.problem, e.t, e.x, e.u, (m.path, m.state, m.control), e.sizes())
+    return jnp.all(over.state <= _WITHIN) & jnp.all(over.control <= _WITHIN)
 
 
 def _check_positions(positions: np.ndarray) -> None:
