@@ -45,7 +45,7 @@ def shot(
     per_arc = (fractions.shape[0] - 1) // arcs
     index = jnp.arange(arcs)[:, None] * per_arc + jnp.arange(per_arc + 1)[None, :]
 
-    def fly(z: Unknowns, problem: Problem) -> Float[Array, "arc node two_n_1"]:
+    def fly(z: Unknowns, problem: Problem) -> Float[Array, "arc point two_n_1"]:
         t0, tf = horizon(problem, z)
         times = t0 + (tf - t0) * fractions
         y = jnp.concatenate([z.starts, jnp.zeros((arcs, 1), z.starts.dtype)], axis=1)
@@ -66,7 +66,7 @@ def _extremal(
     z: Unknowns,
     fractions: Float[Array, " node"],
     tau: Float[Array, " p"],
-    flown: Float[Array, "arc node two_n_1"],
+    flown: Float[Array, "arc point two_n_1"],
 ) -> Extremal:
     """The arcs `flown` side by side, with their controls."""
     y = jnp.concatenate([flown[:, :-1].reshape(-1, flown.shape[2]), flown[-1, -1:]])
