@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from jaxguide.sweeping.sweep import sweep as sweep
     from jaxguide.sweeping.written import dispersions_from as dispersions_from
     from jaxguide.trajectory import Extremal as Extremal
+    from jaxguide.trajectory import Multipliers as Multipliers
     from jaxguide.trajectory import Trajectory as Trajectory
     from jaxguide.transforms.phased import Phased as Phased
     from jaxguide.transforms.phased import PhaseEnds as PhaseEnds
@@ -108,6 +109,7 @@ _HOME = {
     "LogNormal": "montecarlo.dispersions",
     "Method": "nominal.method",
     "Mission": "flight.mission",
+    "Multipliers": "trajectory",
     "MultivariateNormal": "montecarlo.dispersions",
     "NeighboringOptimal": "laws.neighboring",
     "NeighboringSuboptimal": "laws.suboptimal",

@@ -7,6 +7,7 @@ EXAMPLES for each class that fulfils it. A class without an example fails by nam
 # Tests hand over what a type checker would refuse, on purpose.
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 
+import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -108,6 +109,9 @@ EXAMPLES = {
     jg.Adaptive: lambda w, x: jg.Adaptive(1e-6),
     jg.LinearGains: lambda w, x: jg.LinearGains(),
     jg.TimeToGoGains: lambda w, x: jg.TimeToGoGains((2, 1)),
+    jg.Shooting: lambda w, x: jg.Shooting(arcs=2, segments=4, degree=6, starts=2, coarse_steps=16),
+    jg.Pseudospectral: lambda w, x: jg.Pseudospectral(nodes=4, segments=1, refinements=0),
+    jg.PiecewiseLinear: lambda w, x: jg.PiecewiseLinear(3, 4, starts=2),
     ThinnedGains: lambda w, x: ThinnedGains((2, 1), jnp.array([1.0, 0.5, 1.0])),
 }
 
@@ -188,7 +192,23 @@ def use_interpolation(interpolation, w, x):
     return gains, None, None
 
 
+def use_method(method, w, x):
+    """One solve from a state; NaN among its numbers is never a success."""
+    stated = dataclasses.replace(DoubleIntegrator(), initial_state=x)
+    problem = jax.tree_util.tree_map(jnp.asarray, stated)
+    method.check(problem)
+    extremal = method(problem, None)
+    n = extremal.t.shape[0]
+    assert isinstance(extremal, jg.Extremal) and not isinstance(extremal, jg.Certified)
+    assert extremal.x.shape == extremal.costate.shape == (n, 2) and extremal.u.shape == (n, 1)
+    assert isinstance(method.accuracy, float) and isinstance(method.capabilities, jg.Capabilities)
+    good = extremal.result == jg.RESULTS.successful
+    kept = good == jnp.all(jnp.isfinite(x))
+    return jnp.where(kept, extremal.objective, jnp.inf), None, None
+
+
 CONTRACTS = {
+    jg.Method: use_method,
     jg.Law: use_law,
     jg.Command: use_command,
     jg.Hold: use_hold,
@@ -220,9 +240,11 @@ def concrete(contract):
 
 
 CASES = [(contract, c) for contract in CONTRACTS for c in concrete(contract)]
-each = pytest.mark.parametrize(
-    ("contract", "implementation"), CASES, ids=[f"{a.__name__}-{b.__name__}" for a, b in CASES]
-)
+# A solve with its batch and gradient compiles for half a minute.
+MARKED = [pytest.param(*c, marks=[pytest.mark.slow] if c[0] is jg.Method else []) for c in CASES]
+NAMES = [f"{a.__name__}-{b.__name__}" for a, b in CASES]
+each = pytest.mark.parametrize(("contract", "implementation"), CASES, ids=NAMES)
+each_marked = pytest.mark.parametrize(("contract", "implementation"), MARKED, ids=NAMES)
 
 
 def documented(cls):
@@ -249,7 +271,7 @@ def test_signatures_and_docstrings(contract, implementation):
             assert parameters(own) == parameters(getattr(contract, name)), name
 
 
-@each
+@each_marked
 def test_behaviour(contract, implementation, world):
     assert implementation in EXAMPLES, f"no example of {implementation.__name__}: add one"
     make = EXAMPLES[implementation]

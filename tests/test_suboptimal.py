@@ -17,7 +17,7 @@ from conftest import DoubleIntegrator, FreeTime, at
 import jaxguide as jg
 from jaxguide import reproduce
 from jaxguide.neighboring.suboptimal import sensitivities
-from jaxguide.nominal.parametric.extremal import flown
+from jaxguide.nominal.parametric.extremal import parametric_extremal
 from jaxguide.problems.lunar_launch import LunarLaunch, mission
 from jaxguide.reproduce.lunar_launch import flights, published, sections
 
@@ -256,7 +256,7 @@ def test_refuses_problems(launch, integrator):
         jg.solve(DoubleIntegrator(initial_state=(jg.Free(), 0.0)), NINE)
     with pytest.raises(ValueError, match="is an inequality"):
         jg.solve(DoubleIntegrator(endpoint_bounds=(0.0, 1.0)), NINE)
-    few = flown(
+    few = parametric_extremal(
         Placed(),
         np.linspace(0, 1, 5),
         launch.u[::16, 0].tolist() + [272.7],

@@ -2,6 +2,6 @@
 
 from jaxguide.certificate.certified import Certified as Certified
 from jaxguide.certificate.certified import certified as certified
-from jaxguide.certificate.certified import plain as plain
+from jaxguide.certificate.certified import uncertified as uncertified
 from jaxguide.certificate.certify import certify as certify
 from jaxguide.certificate.table import Certificate as Certificate

@@ -33,7 +33,7 @@ def certified(extremal: Extremal, accuracy: float) -> Certified:
     return Certified(**{name: getattr(extremal, name) for name in _FIELDS}, accuracy=accuracy)
 
 
-def plain(extremal: Extremal) -> Extremal:
+def uncertified(extremal: Extremal) -> Extremal:
     """`extremal` without its certificate: a guess is the same to a compiled program whether a
     method or `jg.solve` made it."""
     return Extremal(**{name: getattr(extremal, name) for name in _FIELDS})

@@ -4,7 +4,7 @@ import equinox as eqx
 
 from jaxguide.certificate import checks, costly
 from jaxguide.certificate.along import Along
-from jaxguide.certificate.table import Certificate, Rows
+from jaxguide.certificate.table import Certificate, Checks
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import closed
 
@@ -25,19 +25,19 @@ def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -
 
 @eqx.filter_jit
 def _certified(extremal: Extremal, fly: bool, tight: float) -> Certificate:
-    rows, along = Rows(), Along(extremal if extremal.stretch is None else closed(extremal))
+    rows, along = Checks(), Along(extremal if extremal.stretch is None else closed(extremal))
     if fly:
-        costly.flown(rows, along)
+        costly.propagation(rows, along)
     for check in (
-        checks.canonical,
+        checks.canonical_equations,
         checks.boundary,
         checks.energy,
         checks.jumps,
         checks.stationarity,
         checks.bounds,
         checks.integrals,
-        checks.parameters,
-        checks.tails,
+        checks.static_parameters,
+        checks.spectral_tails,
     ):
         check(rows, along, tight)
     return rows.done()

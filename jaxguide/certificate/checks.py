@@ -11,8 +11,8 @@ from jaxtyping import Array
 
 from jaxguide.bounds import bound_size, overstep, slackness
 from jaxguide.certificate.along import Along
-from jaxguide.certificate.table import Rows
-from jaxguide.conditions.bounded import bounded
+from jaxguide.certificate.table import Checks
+from jaxguide.conditions.bounded import bound_errors
 from jaxguide.conditions.hamiltonian import (
     constrained_hamiltonian,
     endpoint_lagrangian,
@@ -26,7 +26,7 @@ def _costates(problem: Problem) -> tuple[str, ...]:
     return tuple(f"costate of {name}" for name in problem.state_names)
 
 
-def canonical(rows: Rows, a: Along, tight: float) -> None:
+def canonical_equations(rows: Checks, a: Along, tight: float) -> None:
     """Canonical equations, eqs (2) and (6), in integral form on Gauss points between the nodes."""
     problem, size, after = a.extremal.problem, a.size, a.breaks[1:]
     f = a.at_gauss(lambda p, t, x, u, c, k: p.dynamics(t, x, u))
@@ -38,7 +38,7 @@ def canonical(rows: Rows, a: Along, tight: float) -> None:
     rows.add("costate equation", _costates(problem), gap, after, tight)
 
 
-def boundary(rows: Rows, a: Along, tight: float) -> None:
+def boundary(rows: Checks, a: Along, tight: float) -> None:
     """Boundary data and transversality, eqs (3), (8), (9)."""
     extremal, size, (x0, xf, t0, tf) = a.extremal, a.size, a.ends()
     problem, nu, costate = extremal.problem, extremal.multipliers.endpoint, extremal.costate
@@ -61,7 +61,7 @@ def boundary(rows: Rows, a: Along, tight: float) -> None:
         rows.add("transversality, start", _costates(problem), gap[None], t0[None], tight)
 
 
-def energy(rows: Rows, a: Along, tight: float) -> None:
+def energy(rows: Checks, a: Along, tight: float) -> None:
     """The Hamiltonian: dH/dt = H_t along the extremal, and its values at free times."""
     extremal, size, (_, _, t0, tf) = a.extremal, a.size, a.ends()
     problem, r, half = extremal.problem, extremal.multipliers.integral, a.half
@@ -96,7 +96,7 @@ def energy(rows: Rows, a: Along, tight: float) -> None:
         rows.add("H on average", ("H",), gap, tf[None], tight)
 
 
-def jumps(rows: Rows, a: Along, tight: float) -> None:
+def jumps(rows: Checks, a: Along, tight: float) -> None:
     """At a break the costate may jump, by a covector of a bound that is met there."""
     extremal, step = a.extremal, a.extremal.reference_nodes.shape[0] - 1
     if extremal.costate_before is None:
@@ -109,7 +109,7 @@ def jumps(rows: Rows, a: Along, tight: float) -> None:
     rows.add("costate jumps", _costates(extremal.problem), gap, a.breaks[1:-1], tight)
 
 
-def stationarity(rows: Rows, a: Along, tight: float) -> None:
+def stationarity(rows: Checks, a: Along, tight: float) -> None:
     """H bar stationary in the control, and convex (Legendre-Clebsch)."""
     extremal, size, problem = a.extremal, a.size, a.extremal.problem
     t, names, slope = (
@@ -134,12 +134,12 @@ def stationarity(rows: Rows, a: Along, tight: float) -> None:
     rows.add_signed("Legendre-Clebsch", ("-min eig H_uu",), -least[worst], t[worst], 0.0)
 
 
-def bounds(rows: Rows, a: Along, tight: float) -> None:
+def bounds(rows: Checks, a: Along, tight: float) -> None:
     """Path constraints, states and controls within bounds, and the signs of their covectors."""
     extremal, problem, t = a.extremal, a.extremal.problem, a.extremal.t
     m = extremal.multipliers
     covectors = (m.path, m.state, m.control)
-    found = bounded(problem, t, extremal.x, extremal.u, covectors, a.size)
+    found = bound_errors(problem, t, extremal.x, extremal.u, covectors, a.size)
     paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
     rows.add("path constraints", paths, found.path, t, tight)
@@ -148,7 +148,7 @@ def bounds(rows: Rows, a: Along, tight: float) -> None:
     rows.add("complementarity", paths + states + controls, found.complementarity, t, tight)
 
 
-def integrals(rows: Rows, a: Along, tight: float) -> None:
+def integrals(rows: Checks, a: Along, tight: float) -> None:
     """Integral constraints, and the signs of their covectors."""
     problem, r, tf = a.extremal.problem, a.extremal.multipliers.integral, a.extremal.t[-1]
     each = a.at_gauss(lambda p, t, x, u, c, k: p.integrands(t, x, u))
@@ -161,7 +161,7 @@ def integrals(rows: Rows, a: Along, tight: float) -> None:
     rows.add("complementarity, integrals", labels, signs[None], tf[None], tight)
 
 
-def parameters(rows: Rows, a: Along, tight: float) -> None:
+def static_parameters(rows: Checks, a: Along, tight: float) -> None:
     """Static parameters: the gradient of Ebar + int H bar dt vanishes, or a bound holds it."""
     problem, chosen, tf = a.extremal.problem, a.extremal.chosen, a.extremal.t[-1]
     if chosen is None:
@@ -178,7 +178,7 @@ def parameters(rows: Rows, a: Along, tight: float) -> None:
     rows.add("static parameters", chosen.names, gap[None], tf[None], tight)
 
 
-def tails(rows: Rows, a: Along, tight: float) -> None:
+def spectral_tails(rows: Checks, a: Along, tight: float) -> None:
     """Spectral tails: the last two Legendre coefficients of each segment's polynomial."""
     problem, last = a.extremal.problem, legendre_matrix(a.extremal.reference_nodes)[-2:]
     tail = lambda parts, of: (

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxguide.certificate.along import Along
-from jaxguide.certificate.table import Rows
+from jaxguide.certificate.table import Checks
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, solve_sweeps
 from jaxguide.neighboring.sufficiency import conjugate_ahead
@@ -13,7 +13,7 @@ from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 
 
-def flown(rows: Rows, a: Along) -> None:
+def propagation(rows: Checks, a: Along) -> None:
     """Its states against those of the interpolated control, and conjugate points."""
     extremal = a.extremal
     problem, t = extremal.problem, extremal.t

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 
 class Certificate(eqx.Module):
-    """Rows of checks. `passed` is a bool array; printed, a table that names the worst place.
+    """Checks of checks. `passed` is a bool array; printed, a table that names the worst place.
 
     Of a batch of extremals every array has a leading axis of lanes; printed, each row is that of
     the worst lane."""
@@ -24,6 +24,7 @@ class Certificate(eqx.Module):
 
     @property
     def passed(self) -> Bool[Array, " row"]:
+        """Whether each row's value is within its tolerance."""
         return self.value <= self.tolerance  # NaN fails
 
     def worst(self) -> "Certificate":
@@ -77,7 +78,7 @@ class Certificate(eqx.Module):
         ]  # fmt: skip
 
 
-class Rows:
+class Checks:
     """Collects rows while the checks are traced."""
 
     def __init__(self):
@@ -111,6 +112,7 @@ class Rows:
         self.component.append(jnp.zeros((), jnp.int64 if value.dtype == jnp.float64 else jnp.int32))
 
     def done(self) -> Certificate:
+        """The Certificate of all rows."""
         stack = jnp.stack
         return Certificate(
             tuple(self.names),

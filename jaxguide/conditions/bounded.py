@@ -14,7 +14,7 @@ from jaxguide.conditions.sizes import Sizes
 from jaxguide.problem import Problem
 
 
-class Bounded(NamedTuple):
+class BoundErrors(NamedTuple):
     """By node, relative to sizes: oversteps of path constraints, states and controls, and
     complementarity of all three, side by side in that order, relative to the Hamiltonian."""
 
@@ -24,14 +24,14 @@ class Bounded(NamedTuple):
     complementarity: Float[Array, "node p_n_m"]
 
 
-def bounded(
+def bound_errors(
     problem: Problem,
     t: Float[Array, " node"],
     x: Float[Array, "node n"],
     u: Float[Array, "node m"],
     multipliers: tuple[Array, Array, Array],
     size: Sizes,
-) -> Bounded:
+) -> BoundErrors:
     """`multipliers`: of path constraints, states and controls, (node, k) each."""
     h = jax.vmap(problem.path_constraints)(t, x, u)
     kinds: Any = (
@@ -45,4 +45,4 @@ def bounded(
         slack(by, values, within, of) * of[None]
         for by, (values, within, of) in zip(multipliers, kinds, strict=True)
     ]
-    return Bounded(path, state, control, jnp.concatenate(signs, axis=1) / size.hamiltonian)
+    return BoundErrors(path, state, control, jnp.concatenate(signs, axis=1) / size.hamiltonian)

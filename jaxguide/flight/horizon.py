@@ -20,7 +20,7 @@ _ROUNDING = 1e-12
 _NO_SAMPLE = 1e-9
 
 
-def horizon(plant: Problem, law: Any, initial_time: Any, final_time: Any) -> tuple[Any, Any]:
+def flight_horizon(plant: Problem, law: Any, initial_time: Any, final_time: Any) -> tuple[Any, Any]:
     """First and last time of a mission: those given, or else the plant's, or else the law's latest
     end if it decides the end.
 

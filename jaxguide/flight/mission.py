@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxguide.flight.actuators import Actuator, PlainActuator
 from jaxguide.flight.disturbances import Disturbance, PlainDisturbance
 from jaxguide.flight.estimators import as_estimator
-from jaxguide.flight.horizon import horizon, sample_count
+from jaxguide.flight.horizon import flight_horizon, sample_count
 from jaxguide.flight.integrators import Integrator, RungeKutta4
 from jaxguide.flight.sensors import PlainSensor, Sensor
 from jaxguide.laws.holds import HoldDeviation, PlainHold
@@ -100,7 +100,7 @@ class Mission(eqx.Module):
                 f"Mission: delay is {delay!r}, but commands take effect at once in this version; "
                 "leave it 0."
             )
-        initial_time, final_time = horizon(plant, law, initial_time, final_time)
+        initial_time, final_time = flight_horizon(plant, law, initial_time, final_time)
         self.plant = with_array_leaves(plant)
         self.law = _arrays(law)
         self.initial_state = _initial_state(plant, initial_state)

@@ -31,12 +31,15 @@ class NoProgress:
     """A `Progress` that shows nothing."""
 
     def init(self) -> None:
+        """State of a new meter."""
         return None
 
     def step(self, state: None, progress: Any) -> None:
+        """The new state, having shown `progress`, a number on [0, 1]."""
         return None
 
     def close(self, state: None) -> None:
+        """Ends the meter; called on failure too."""
         return None
 
 
@@ -58,6 +61,7 @@ class RichProgress:
         self.total, self.unit = total, unit
 
     def init(self) -> Any:
+        """State of a new meter."""
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
         from rich.progress import TimeElapsedColumn as Elapsed
@@ -79,6 +83,7 @@ class RichProgress:
         return bar, task, timer, time.perf_counter()
 
     def step(self, state: Any, progress: Any) -> Any:
+        """The new state, having shown `progress`, a number on [0, 1]."""
         bar, task, _, began = state
         rate = ""
         if self.total is not None:
@@ -88,6 +93,7 @@ class RichProgress:
         return state
 
     def close(self, state: Any) -> None:
+        """Ends the meter; called on failure too."""
         bar, _, timer, _ = state
         timer.cancel()
         timer.join()  # a bar about to start has started, so that stop ends it

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.certificate import Certified, certified, plain
+from jaxguide.certificate import Certified, certified, uncertified
 from jaxguide.host.compilation import compiled
 from jaxguide.host.cores import over_cores
 from jaxguide.host.progress import Progress, metered
@@ -63,7 +63,7 @@ def solve_batch(
     method = default_method(batch) if method is None else method
     first = lane(batch, 0)
     stated(first, method, lane(guess, 0) if own else guess)
-    guess = plain(guess) if isinstance(guess, Extremal) else guess
+    guess = uncertified(guess) if isinstance(guess, Extremal) else guess
     if is_traced((batch, guess)):
         one = lambda p, g: solve(p, method, g, throw=False)
         return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxguide.certificate import Certified, certified, plain
+from jaxguide.certificate import Certified, certified, uncertified
 from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.guesses import check_guess, is_key
 from jaxguide.nominal.indirect.shooting import Shooting
@@ -118,7 +118,7 @@ def stated(problem: Problem, method: Method, guess: Any) -> tuple[Problem, Any]:
     method.check(problem)
     maybe_endless = is_endless(problem) or is_traced(problem.final_time)
     check_guess(problem, guess, method, method.capabilities.endless and maybe_endless)
-    return with_array_leaves(problem), plain(guess) if isinstance(guess, Extremal) else guess
+    return with_array_leaves(problem), uncertified(guess) if isinstance(guess, Extremal) else guess
 
 
 def _on_host(method: Method, watch: Any) -> Callable[[Problem, Any], Extremal]:

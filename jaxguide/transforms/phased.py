@@ -139,6 +139,7 @@ class Phased(Problem):
 
     @property
     def initial_state(self) -> tuple[Any, ...]:
+        """One entry a state, phase after phase."""
         return _starts(self.phases)
 
     @property

@@ -35,7 +35,7 @@ _LEAST_SIZE = 1e-300  # of a row of the last system, lest a row of zeros be divi
 _LEAST_CURVATURE = 1e-12
 
 
-class Layout(NamedTuple):
+class SweepLayout(NamedTuple):
     """Where the parameters theta = (start, times, p, xf, lambda_f) of the sweep lie, and where the
     globals that move freely, (x0, times, p), end. lambda_f is the multiplier of the final state.
     """
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
 
 
 class SweepStage(NamedTuple):
-    """A segment of the backward sweep; theta: see `Layout`.
+    """A segment of the backward sweep; theta: see `SweepLayout`.
 
     - `factor`: Cholesky of the Hessian by z. `N`: mixed Hessian by z and theta. `KN`: its feedback,
       z = -(KN theta + k).
@@ -88,12 +88,12 @@ class Factor(NamedTuple):
     held: Bool[Array, " k"]
 
 
-def layout(counts: Counts) -> Layout:
+def sweep_layout(counts: Counts) -> SweepLayout:
     """Places of the sweep's parameters."""
     n, times, p = counts.n, counts.times, counts.parameters
     moving = n + times + p
     theta = moving + 2 * n
-    return Layout(
+    return SweepLayout(
         slice(0, n),
         slice(n, n + times),
         slice(n + times, moving),
@@ -138,7 +138,7 @@ def _sweep(
     """Minimises over the free directions, last segment first: the stages, the Hessian of the value
     before the first segment, and whether every minimum exists."""
     counts, dtype = program.counts, H.dtype
-    n, at = counts.n, layout(counts)
+    n, at = counts.n, sweep_layout(counts)
     nu = H.shape[1] - n - 2 - counts.parameters
     controls = slice(n, n + nu)
     rest = jnp.concatenate([jnp.arange(n), jnp.arange(n + nu, H.shape[1])])  # of v: all but z
@@ -163,7 +163,7 @@ def _sweep(
     return stages, P, ok
 
 
-def _final_value(at: Layout, rho: Array, n: int, dtype: Any) -> Array:
+def _final_value(at: SweepLayout, rho: Array, n: int, dtype: Any) -> Array:
     """Hessian of the value at the end, lambda_f^T (x - xf) + rho |x - xf|^2 / 2."""
     own, xf, lam = at.start, at.xf, at.lambda_f
     eye = jnp.eye(n, dtype=dtype)
@@ -174,7 +174,7 @@ def _final_value(at: Layout, rho: Array, n: int, dtype: Any) -> Array:
     return P.at[xf, lam].set(-eye).at[lam, xf].set(-eye)
 
 
-def _to_segments(program: Transcription, at: Layout, dtype: Any) -> Array:
+def _to_segments(program: Transcription, at: SweepLayout, dtype: Any) -> Array:
     """(start, clock, parameters) of every segment from theta."""
     counts = program.counts
     n, np_ = counts.n, counts.parameters
@@ -191,7 +191,7 @@ def _globals(
     of the endpoint constraints."""
     counts = program.counts
     n, q, dtype = counts.n, counts.end, P.dtype
-    moving = layout(counts).moving
+    moving = sweep_layout(counts).moving
     nb = moving + n  # and xf
     join = lambda w: jnp.concatenate([w.x0, w.times, w.p])
     given = join(system.given)

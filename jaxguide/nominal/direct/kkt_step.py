@@ -18,7 +18,7 @@ from jaxguide.nominal.direct.elimination import (
     over_segments,
     path_springs,
 )
-from jaxguide.nominal.direct.kkt_factor import Factor, flexibility, layout
+from jaxguide.nominal.direct.kkt_factor import Factor, flexibility, sweep_layout
 from jaxguide.nominal.direct.newton_system import COMPLIANCE, Load, NewtonSystem, Step, times_step
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.trees import largest, zeros_like
@@ -107,7 +107,7 @@ def eliminated_step(
     h_dq = jnp.einsum("skha,ska->skh", system.nodes.jacobian[:, :, program.counts.n + 1 :], moved.q)
     path = stiffness * h_dq + pushed
     d_path = h_dq + residual.path - COMPLIANCE * path
-    at = layout(program.counts)
+    at = sweep_layout(program.counts)
     d_end = system.ends.jacobian[1:] @ ends.theta[: at.xf.stop] + residual.end
     primal = Primal(
         ends.theta[at.start],
@@ -188,7 +188,7 @@ def _global_step(
 ) -> _Globals:
     """The global unknowns, by the eigenvectors of their matrix, refined once."""
     force, residual = load
-    at = layout(program.counts)
+    at = sweep_layout(program.counts)
     own_force = jnp.concatenate([force.x0, force.times, force.p])
     p = sweep.p.at[: at.moving].add(own_force)
     pulled = jnp.where(system.given.end, 0.0, flexibility(system) * force.end)
@@ -210,7 +210,7 @@ def _forward(
     ends: _Globals,
 ) -> _Forward:
     """States and controls, first segment first."""
-    n, m, at = program.counts.n, program.counts.m, layout(program.counts)
+    n, m, at = program.counts.n, program.counts.m, sweep_layout(program.counts)
 
     def forward(theta: Array, item: tuple) -> tuple[Array, tuple]:
         s, X, x_end, k, p_after, clock = item

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.bounds import overstep
 from jaxguide.conditions.angles import unwrap_angles
-from jaxguide.conditions.bounded import bounded
+from jaxguide.conditions.bounded import bound_errors
 from jaxguide.conditions.canonical import canonical_rates
 from jaxguide.conditions.control import minimising_control
 from jaxguide.conditions.hamiltonian import hamiltonian
@@ -112,7 +112,7 @@ def judged(extremal: Extremal, worst: Float[Array, ""]) -> RESULTS:
     )
     minimising = jnp.all(jax.vmap(cholesky_positive)(h_uu))
     m = extremal.multipliers
-    over = bounded(problem, t, x, u, (m.path, m.state, m.control), extremal.sizes())
+    over = bound_errors(problem, t, x, u, (m.path, m.state, m.control), extremal.sizes())
     inside = [jnp.all(part <= _WITHIN) for part in (over.path, over.state, over.control)]
     span = jnp.abs(t[-1] - t[0])
     for entry, time in ((problem.initial_time, t[0]), (problem.final_time, t[-1])):

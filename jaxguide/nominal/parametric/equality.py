@@ -86,7 +86,7 @@ def _tangent(d: Derivatives) -> _Tangent:
     return _Tangent(-d.jacobian.T @ gauss_solve(gram, d.c), projector, matrix, size)
 
 
-def minimise(
+def local_minimum(
     values: Values, a: Array, args: Any, iterations: int
 ) -> tuple[KKTPoint, Float[Array, ""], Bool[Array, ""]]:
     """A local minimum from `a`, its KKT residual, and whether the Hessian of the Lagrangian is

@@ -16,7 +16,7 @@ from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
 
 
-def flown(
+def parametric_extremal(
     problem: Problem,
     positions: Any,
     a: Any,

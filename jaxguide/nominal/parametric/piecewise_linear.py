@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of, positive
-from jaxguide.conditions.bounded import bounded
+from jaxguide.conditions.bounded import bound_errors
 from jaxguide.conditions.units import natural_units
 from jaxguide.nominal.ends import nearest_ends
 from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.nominal.parametric import flow as par
-from jaxguide.nominal.parametric.equality import KKTPoint, minimise, polished, residual
-from jaxguide.nominal.parametric.extremal import flown
+from jaxguide.nominal.parametric.equality import KKTPoint, local_minimum, polished, residual
+from jaxguide.nominal.parametric.extremal import parametric_extremal
 from jaxguide.nominal.starts import control_ends
 from jaxguide.problem import (
     Problem,
@@ -134,7 +134,7 @@ class PiecewiseLinear(Method):
 
         def attempt(a: Array, units: Units) -> tuple[KKTPoint, Array, Array, Array]:
             args = (frozen, positions)
-            found = minimise(self._values(units), a / units.a, args, _ITERATIONS)
+            found = local_minimum(self._values(units), a / units.a, args, _ITERATIONS)
             return *found, self._values(units)(found[0].a, args)[0] * units.f
 
         zs, errors, minimal, costs = jax.lax.stop_gradient(jax.vmap(attempt)(begin, units))
@@ -145,7 +145,7 @@ class PiecewiseLinear(Method):
         values, args = self._values(units), (problem, self.positions)
         z = polished(values, z, args)
         error = residual(values, z, args)
-        extremal = flown(
+        extremal = parametric_extremal(
             problem,
             self.positions,
             z.a * units.a,
@@ -240,7 +240,7 @@ def _starts(
 def _within_bounds(extremal: Extremal) -> Array:
     """Whether state and control keep within their bounds, which are not enforced."""
     e, m = extremal, extremal.multipliers
-    over = bounded(e.problem, e.t, e.x, e.u, (m.path, m.state, m.control), e.sizes())
+    over = bound_errors(e.problem, e.t, e.x, e.u, (m.path, m.state, m.control), e.sizes())
     return jnp.all(over.state <= _WITHIN) & jnp.all(over.control <= _WITHIN)
 
 

@@ -4,16 +4,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.conditions.bounded import bounded
+from jaxguide.conditions.bounded import bound_errors
 from jaxguide.trajectory import Extremal
 
 
 @eqx.filter_jit
-def bound_errors(extremal: Extremal) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def worst_bound_errors(extremal: Extremal) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The largest overstep of a bound or path constraint, and the largest complementarity, over all
     nodes: the values of these rows of the certificate."""
     e, m = extremal, extremal.multipliers
-    found = bounded(e.problem, e.t, e.x, e.u, (m.path, m.state, m.control), e.sizes())
+    found = bound_errors(e.problem, e.t, e.x, e.u, (m.path, m.state, m.control), e.sizes())
     over = [jnp.max(a, initial=0.0) for a in (found.path, found.state, found.control)]
     complementarity = jnp.max(jnp.abs(found.complementarity), initial=0.0)
     return jnp.max(jnp.stack(over)), complementarity

@@ -15,7 +15,7 @@ from jaxguide.nominal.defects import segment_errors
 from jaxguide.nominal.refinement.arcs import Arcs, corrected, without_collapsed
 from jaxguide.nominal.refinement.layout import laid_out
 from jaxguide.nominal.refinement.meshes import MeshStep, remeshed
-from jaxguide.nominal.refinement.soundness import bound_errors
+from jaxguide.nominal.refinement.soundness import worst_bound_errors
 from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import Endless
@@ -89,5 +89,5 @@ def _solved(
 
 def _wrongness(exact: Extremal) -> float:
     """Its complementarity; infinite where a bound is overstepped between nodes."""
-    over, complementarity = (float(v) for v in bound_errors(exact))
+    over, complementarity = (float(v) for v in worst_bound_errors(exact))
     return complementarity if over <= _BEYOND else np.inf

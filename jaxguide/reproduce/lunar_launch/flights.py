@@ -17,7 +17,7 @@ from jaxguide.laws.gain_interpolation import LinearGains
 from jaxguide.laws.law import OpenLoop
 from jaxguide.laws.suboptimal import NeighboringSuboptimal
 from jaxguide.neighboring.suboptimal import suboptimal_gains
-from jaxguide.nominal.parametric.extremal import flown
+from jaxguide.nominal.parametric.extremal import parametric_extremal
 from jaxguide.nominal.parametric.flow import pack
 from jaxguide.nominal.parametric.piecewise_linear import PiecewiseLinear
 from jaxguide.problems.lunar_launch import LunarLaunch, mission
@@ -44,7 +44,7 @@ def printed_nominal() -> Certified:
     """The control of the thesis, eq. (5.1), flown: not quite the minimiser, but the trajectory
     about which the printed gains are computed."""
     problem, nodes = LunarLaunch(), np.linspace(0.0, 1.0, len(THETA))
-    fly = lambda a: flown(problem, nodes, a, None)
+    fly = lambda a: parametric_extremal(problem, nodes, a, None)
     parameters = pack(problem, jnp.asarray(THETA)[:, None], FINAL_TIME)
     return certified(eqx.filter_jit(fly)(parameters), PiecewiseLinear.accuracy)
 

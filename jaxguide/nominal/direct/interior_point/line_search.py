@@ -109,7 +109,7 @@ def searched(
 
     def shorten(carry: tuple) -> tuple:
         alpha, _, _, k = carry
-        half = judged(search, aim.mu, alpha / 2, slope, step.primal, alpha / 2)
+        half = judged_trial(search, aim.mu, alpha / 2, slope, step.primal, alpha / 2)
         return alpha / 2, half.ok, half.f_type, k + 1
 
     # An estimate of the multipliers moves nothing, so that there is no length to look for.
@@ -141,7 +141,7 @@ def _aimed(search: Search) -> Aim:
         length = jnp.minimum(inside, patient_length(setup.program, s.w, step.primal))
         first = choose(now.count == 0, (step, length), now.first)
         slope = _slope(search, now.mu, first[0].primal)
-        trial = judged(search, now.mu, first[1], slope, step.primal, length)
+        trial = judged_trial(search, now.mu, first[1], slope, step.primal, length)
         ok = trial.ok & all_finite(step) & ~probe
         sound = probe & matrix.regular & all_finite(step)
         mu = jnp.where(sound, probed(setup, at, barrier, step), now.mu)
@@ -159,7 +159,7 @@ def _aimed(search: Search) -> Aim:
     return jax.lax.while_loop(lambda a: a.again, aim, start)
 
 
-def judged(
+def judged_trial(
     search: Search, mu: Array, alpha: Array, slope: Array, d: Array, length: Array
 ) -> Judgement:
     """Whether the move by `length` d is acceptable as a step of size `alpha`, whose barrier
