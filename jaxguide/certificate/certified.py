@@ -1,6 +1,7 @@
 """An Extremal with its certificate: what `jg.solve` returns."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,8 +9,6 @@ import jax
 from jaxguide.certificate.certify import certify
 from jaxguide.certificate.table import Certificate
 from jaxguide.trajectory import Extremal
-
-_FIELDS = tuple(field.name for field in dataclasses.fields(Extremal))
 
 
 class Certified(Extremal):
@@ -29,11 +28,17 @@ class Certified(Extremal):
 
 
 def certified(extremal: Extremal, accuracy: float) -> Certified:
-    """`extremal` with its certificate."""
-    return Certified(**{name: getattr(extremal, name) for name in _FIELDS}, accuracy=accuracy)
+    """`extremal`, or a batch of them, with its certificate."""
+    one = lambda e: Certified(**_fields(e), accuracy=accuracy)
+    return jax.vmap(one)(extremal) if extremal.t.ndim == 2 else one(extremal)
 
 
 def uncertified(extremal: Extremal) -> Extremal:
-    """`extremal` without its certificate: a guess is the same to a compiled program whether a
-    method or `jg.solve` made it."""
-    return Extremal(**{name: getattr(extremal, name) for name in _FIELDS})
+    """`extremal`, or a batch of them, without its certificate: as a guess it is the same to a
+    compiled program whether a method or `jg.solve` made it."""
+    one = lambda e: Extremal(**_fields(e))
+    return jax.vmap(one)(extremal) if extremal.t.ndim == 2 else one(extremal)
+
+
+def _fields(extremal: Extremal) -> dict[str, Any]:
+    return {field.name: getattr(extremal, field.name) for field in dataclasses.fields(Extremal)}
