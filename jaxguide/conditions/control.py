@@ -15,7 +15,7 @@ from jaxguide.problem import Problem, start_control
 # solution the correct digits double with each step, so that most of the 40 are left for the damped
 # steps before; a vmapped loop runs to its slowest lane, so that there must be a limit.
 _ROUNDING, _MAX_STEPS = 4, 40
-# Step lengths tried, all at once; by experiment on the library. H_u = 0 has few unknowns, so that
+# Step lengths tried, all at once: a choice. H_u = 0 has few unknowns, so that
 # six values of H cost less than a search one after the other.
 _STEPS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.003)
 # A full step below this part of the control's size is taken whatever H says: near the solution the
@@ -62,7 +62,7 @@ def newton_control(
     def direction(u: Array) -> tuple[Array, Array]:
         g, h_uu = gradient(u), jax.jacfwd(gradient)(u)
         # Where H_uu is not positive definite, it is shifted by Gershgorin's bound on its lowest
-        # eigenvalue; a tenth of its size more keeps the step finite (by experiment on the library).
+        # eigenvalue; a tenth of its size more keeps the step finite (a choice).
         radius = jnp.sum(jnp.abs(h_uu), axis=1) - jnp.abs(jnp.diag(h_uu))
         lowest = jnp.min(jnp.diag(h_uu) - radius)
         size = jnp.max(jnp.abs(h_uu)) + jnp.finfo(u.dtype).tiny
@@ -94,8 +94,7 @@ def newton_control(
 
 # Parts of the control's size. `_FREE`: what the barrier's forces, of 1e-9 and less, would move the
 # control by stays below this where no constraint is active. `_NEAR`: how far a Newton step may go,
-# beyond an interpolation's error and short of another branch of H_u = 0 (by experiment on the
-# library).
+# beyond an interpolation's error and short of another branch of H_u = 0: a choice.
 _FREE, _NEAR = 1e-7, 1e-3
 
 

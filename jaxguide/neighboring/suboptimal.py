@@ -19,7 +19,7 @@ from jaxguide.types import is_traced, require_x64
 
 # Least pivot of the Gram matrix of unit constraint rows below which they count as dependent. Pivots
 # are squares of sines: rows that differ by an angle of 3e-5 count as independent, and rounding
-# leaves 1e-15. By experiment on stations close to the end of the lunar launch.
+# leaves 1e-15: a choice between the two.
 _RANK = 1e-9
 
 
