@@ -62,14 +62,14 @@ def solve_batch(
         )
     method = default_method(batch) if method is None else method
     first = lane(batch, 0)
-    stated(first, method, lane(guess, 0) if own else guess)
+    _, _, without_end = stated(first, method, lane(guess, 0) if own else guess)
     guess = uncertified(guess) if isinstance(guess, Extremal) else guess
     if is_traced((batch, guess)):
         one = lambda p, g: solve(p, method, g, throw=False)
         return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)
     # On the host, so that taking a chunk costs no dispatch.
     batch, guess = jax.device_get((batch, guess))
-    one = on_fixed_mesh(first, method)
+    one = jax.tree_util.Partial(on_fixed_mesh, method, without_end)
 
     def chunk(k: int) -> Extremal:
         at = np.arange(k * CHUNK, min((k + 1) * CHUNK, count))

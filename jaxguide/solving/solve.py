@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from jaxguide.certificate import Certified, certified, uncertified
@@ -53,13 +52,13 @@ def solve(
     if method is None and not is_traced((problem, guess)):
         return _by_default(problem, guess, throw, watch)
     method = default_method(problem) if method is None else method
-    problem, guess = stated(problem, method, guess)
-    pure = is_traced((problem, guess, method))
-    solved = on_fixed_mesh(problem, method) if pure else _on_host(method, watch)
-    extremal = certified(solved(problem, guess), method.accuracy)
-    if throw and not pure:
+    problem, guess, without_end = stated(problem, method, guess)
+    if is_traced((problem, guess, method)):
+        return certified(on_fixed_mesh(method, without_end, problem, guess), method.accuracy)
+    extremal = _on_host(method, without_end, problem, guess, watch)
+    if throw:
         raise_if_failed(extremal)
-    return extremal
+    return certified(extremal, method.accuracy)
 
 
 def _by_default(problem: Problem, guess: Any, throw: bool, watch: Any) -> Certified:
@@ -104,8 +103,9 @@ def _is_unconstrained(problem: Problem) -> bool:
     )
 
 
-def stated(problem: Problem, method: Method, guess: Any) -> tuple[Problem, Any]:
-    """Problem and guess as a method takes them, once nothing is wrong with either.
+def stated(problem: Problem, method: Method, guess: Any) -> tuple[Problem, Any, bool]:
+    """Problem and guess as a method takes them, once nothing is wrong with either; and whether the
+    horizon has no end.
 
     **Raises:** `ValueError`.
     """
@@ -116,33 +116,28 @@ def stated(problem: Problem, method: Method, guess: Any) -> tuple[Problem, Any]:
     validate(problem)
     refuse_beyond(method, problem)
     method.check(problem)
-    maybe_endless = is_endless(problem) or is_traced(problem.final_time)
-    check_guess(problem, guess, method, method.capabilities.endless and maybe_endless)
-    return with_array_leaves(problem), uncertified(guess) if isinstance(guess, Extremal) else guess
+    without_end = is_endless(problem)
+    maybe = without_end or is_traced(problem.final_time)
+    check_guess(problem, guess, method, method.capabilities.endless and maybe)
+    guess = uncertified(guess) if isinstance(guess, Extremal) else guess
+    return with_array_leaves(problem), guess, without_end
 
 
-def _on_host(method: Method, watch: Any) -> Callable[[Problem, Any], Extremal]:
+def _on_host(
+    method: Method, without_end: bool, problem: Problem, guess: Any, watch: Any
+) -> Extremal:
     """Starts and refinement, each solve a compiled program."""
-
-    def solved(problem: Problem, guess: Any) -> Extremal:
-        without_end = is_endless(problem)
-        if without_end:
-            problem, guess = made_finite(problem, guess, method)
-        extremal = from_starts(method, problem, guess)
-        if method.capabilities.mesh:
-            extremal = refined(method, problem, extremal, watch)
-        return opened(extremal) if without_end else extremal
-
-    return solved
-
-
-def on_fixed_mesh(problem: Problem, method: Method) -> Callable[[Problem, Any], Extremal]:
-    """What `solve` does under a trace, pure, for checked problems of this one's structure."""
-    return jax.tree_util.Partial(_traced, method, is_endless(problem))
+    if without_end:
+        problem, guess = made_finite(problem, guess, method)
+    extremal = from_starts(method, problem, guess)
+    if method.capabilities.mesh:
+        extremal = refined(method, problem, extremal, watch)
+    return opened(extremal) if without_end else extremal
 
 
 @eqx.filter_jit  # else a bare jax.grad runs it operation by operation
-def _traced(method: Method, without_end: bool, problem: Problem, guess: Any) -> Extremal:
+def on_fixed_mesh(method: Method, without_end: bool, problem: Problem, guess: Any) -> Extremal:
+    """What `solve` does under a trace: pure, for a problem that has been `stated`."""
     if without_end:
         problem, guess = made_finite(problem, guess, method)
     extremal = method(problem, guess)
