@@ -261,7 +261,6 @@ def test_refuses_problems(launch, integrator):
         np.linspace(0, 1, 5),
         launch.u[::16, 0].tolist() + [272.7],
         jnp.zeros(4),
-        jg.certify,
     )
     with pytest.raises(ValueError, match="3 parameters of Placed remain for 4 endpoint constraint"):
         jg.suboptimal_gains(few, stations=(0.0, 0.75))

@@ -11,7 +11,6 @@ from jaxguide.certificate import Certified, certified, uncertified
 from jaxguide.host.compilation import compiled
 from jaxguide.host.cores import over_cores
 from jaxguide.host.progress import Progress, metered
-from jaxguide.nominal.method import Method
 from jaxguide.problem import Problem, with_array_leaves
 from jaxguide.solving.solve import default_method, on_fixed_mesh, solve, stated
 from jaxguide.trajectory import Extremal
@@ -24,7 +23,7 @@ CHUNK = 16  # lanes that one thread solves in one call of the program: dispatch 
 
 def solve_batch(
     problems: Problem | Sequence[Problem],
-    method: Method | None = None,
+    method: Any = None,
     guess: Extremal | None = None,
     throw: bool = False,
     progress: Progress | None = None,

@@ -22,7 +22,7 @@ from jaxguide.types import SolveError, is_traced, require_x64, succeeded
 
 def solve(
     problem: Problem,
-    method: Method | None = None,
+    method: Any = None,
     guess: Any = None,
     throw: bool = True,
     watch: Callable[[Any], None] | None = None,
