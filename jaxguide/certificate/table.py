@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float
 
 
 class Certificate(eqx.Module):
-    """Checks of checks. `passed` is a bool array; printed, a table that names the worst place.
+    """Rows of checks, one a condition. `passed` is a bool array; printed, it is a table that names
+    the worst place.
 
     Of a batch of extremals every array has a leading axis of lanes; printed, each row is that of
     the worst lane."""

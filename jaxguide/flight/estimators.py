@@ -1,4 +1,4 @@
-"""Estimators: the state as the law is told it, from measurements and from the controls flown."""
+"""Estimators: the state that the law is given, from measurements and from the controls flown."""
 
 import abc
 from typing import Any, NamedTuple

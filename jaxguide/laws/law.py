@@ -58,7 +58,7 @@ class Law(eqx.Module):
     `memory` is a pytree of what the law must remember from one sample to the next, None if nothing.
     It keeps its structure, shapes and dtypes, since a flight is one `lax.scan`. Both methods must
     work under `jit`, `vmap` and `grad`: no Python branch on the value of an array, and no exception
-    for one; what goes wrong is said in the command's `result`.
+    for one; the command's `result` says what went wrong.
     """
 
     # Whether a flight ends when the law's `time_to_go` is zero; otherwise it ends at the mission's

@@ -1,5 +1,5 @@
-"""What is wrong with an extremal that was not found: the worst constraint by name, node, time and
-value, in the user's units. Host only."""
+"""Why no extremal was found: the worst constraint by name, node, time and value, in the user's
+units. Host only."""
 
 from typing import Any
 
@@ -19,15 +19,15 @@ _NEGLIGIBLE = 1e-8  # of a constraint's size: no miss
 def why(extremal: Extremal) -> str:
     """One sentence or two: the reason, the worst miss, what to try."""
     problem = extremal.problem
-    said = [f"{type(problem).__name__}: {RESULTS[extremal.result]}"]
+    sentences = [f"{type(problem).__name__}: {RESULTS[extremal.result]}"]
     undefined = _undefined(extremal)
     if undefined:
-        said.append(undefined)
+        sentences.append(undefined)
     else:
         misses = sorted(_misses(extremal), key=lambda m: -m[0])
-        said += [text for size, text in misses[:2] if size > _NEGLIGIBLE]
-    said.append(f"Largest scaled residual {float(extremal.residual):.2e}.")
-    return " ".join(said)
+        sentences += [text for size, text in misses[:2] if size > _NEGLIGIBLE]
+    sentences.append(f"Largest scaled residual {float(extremal.residual):.2e}.")
+    return " ".join(sentences)
 
 
 def _undefined(extremal: Extremal) -> str:

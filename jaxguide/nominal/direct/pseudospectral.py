@@ -37,11 +37,11 @@ from jaxguide.transforms.relaxed import relaxed
 from jaxguide.transforms.wrapped import rewrapped
 from jaxguide.types import RESULTS, is_traced
 
-_MOST_NODES = 512
+_MOST_NODES = 512  # up to which the families keep their digits: see `jaxguide/spectral/nodes.py`
 
 
 def _hashable(numbers: Any) -> Any:
-    """A number, or a tuple of the numbers of any sequence: what a static field can hold."""
+    """A number, or a sequence as a tuple of numbers, so that a static field can hold it."""
     numbers = np.asarray(numbers, float)
     return tuple(numbers.tolist()) if numbers.ndim else float(numbers)
 
@@ -56,9 +56,9 @@ class Pseudospectral(Method):
       `jg.NodeFamily` of your own.
     - `nodes`: collocation nodes a segment. `segments`: how many, of equal length; or instead
       `fractions`, the break points of the horizon from 0 to 1. `knots`: which of the inner ones
-      (counted from 1) are free: the optimiser places them, from where `fractions` says, and the
-      others keep their places between them. For switches, kinks and junctions.
-    - `arcwise`: what is known of each segment's arc: controls at bounds, singular, and so on.
+      (counted from 1) are free: the optimiser moves them from their `fractions`, and the others
+      keep their places between them. For switches, kinks and junctions.
+    - `arcwise`: knowledge of each segment's arc: controls at bounds, singular, and so on.
     - `smoothing`: of controls known to be singular, a number or (m,): weights of the squares of the
       upper half of their Legendre coefficients, as in `Arcwise.smooth`; of the order of 100.
     - `relaxation`: how far the dynamics may be missed at the nodes, in state per time, a number or
@@ -66,22 +66,22 @@ class Pseudospectral(Method):
     - `time_scale`: of an infinite horizon, t = t0 + time_scale (1 + s)/(1 - s). It is solved on
       Radau nodes that leave out s = 1, where the state vanishes unless the Problem has endpoint
       constraints of its own.
-    - `starts`, `seed`: how many guesses to solve from, the first straight and the others random,
-      for the best of what they find. Under a trace: one.
+    - `starts`, `seed`: how many guesses to solve from, the first straight and the others random;
+      the solution of least objective is returned. Under a trace: one.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
     - `refinements`: how often `solve` may raise the number of nodes or segments (it also moves
       breaks, and frees the junctions of a clear structure) until each segment's defect between the
       nodes, relative to the state's span, is below `mesh_tolerance`. Zero: one solve. Under a
-      trace and in `solve_batch` the mesh stays, and a solution that it does not resolve so far is
-      `RESULTS.underresolved`; zero refinements take it as it is.
+      trace and in `solve_batch` the mesh stays, and a solution whose defect is larger is
+      `RESULTS.underresolved`; with zero refinements it is taken as it is.
     - `log`: print the designer units and the optimiser's iterations: objective, worst constraint,
       scaled error, barrier, regularisation, step; "r" marks restoration, "e" an estimate of the
       multipliers.
     - `quick`: compile in half the time, for programs a fifth slower. False where one mesh is solved
       on many times. Under a trace whoever compiles decides.
 
-    **Error:** spectral in `nodes` where the solution is smooth; the Certificate tells. Derivatives
-    by parameters and by `fractions` are implicit, of the discrete solution.
+    **Error:** spectral in `nodes` where the solution is smooth; the Certificate measures it.
+    Derivatives by parameters and by `fractions` are implicit, of the discrete solution.
 
     **Source:** review, eqs (10)-(16), (21), (23); Waechter & Biegler (2006).
     """
