@@ -71,6 +71,7 @@ def closed_form(area, reach, start, push, pull, wall, least):
     return 100 * T + a + others + (push**2 + pull**2 + (2 - wall) ** 2) * T / 2
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_bounds_of_every_kind():
     values = jnp.array([0.4, 0.8, 0.3, 0.5, 0.7, 1.2, 1.5])
     method = jg.Pseudospectral(nodes=6, segments=1, refinements=0)

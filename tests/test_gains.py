@@ -403,6 +403,7 @@ def test_a_schedule_passes_through_jit(di_schedule):
     np.testing.assert_array_equal(got[0].K, di_schedule.K)
 
 
+@pytest.mark.slow
 def test_gains_differentiate_through_the_solve():
     method = jg.Shooting(arcs=1, segments=4, starts=1)
 

@@ -139,6 +139,7 @@ class Timed(First):
         return self.share
 
 
+@pytest.mark.slow
 def test_a_phase_whose_final_time_is_a_property():
     phased = jg.Phased((Timed(), Second()))
     e = jg.solve(phased, jg.Pseudospectral(nodes=6, segments=1, refinements=0))
@@ -164,6 +165,7 @@ def cost(by):
     return jg.solve(jg.Phased((First(), Second()), Jump(by)), SMALL, throw=False).objective
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_state_by_links():
     np.testing.assert_allclose(jax.value_and_grad(cost)(0.5), (1.5, -6.0), rtol=1e-8)
 

@@ -153,6 +153,7 @@ def test_free_final_time():
     assert np.all(e.certificate.passed), str(e.certificate)
 
 
+@pytest.mark.slow
 def test_static_parameter():
     # J = 6/k^2 falls with k, whose bound it meets; the extremal's Problem holds the number found.
     problem = dataclasses.replace(DoubleIntegrator(), k=jg.Free(0.5, 2.0, 1.0))
@@ -428,6 +429,7 @@ def test_discontinuous_dynamics_fail_the_certificate():
     assert not rows["state equation"]
 
 
+@pytest.mark.slow
 def test_warm_start_with_multipliers(capfd):
     """A solution of one mesh is one of the next, but for a few steps; the log counts them."""
     method = jg.Pseudospectral(nodes=5, segments=4, refinements=0, log=True)

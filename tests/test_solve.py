@@ -207,6 +207,7 @@ def batch(of_thrust):
     return h, thrust, eqx.filter_jit(jax.vmap(of_thrust))(thrust)
 
 
+@pytest.mark.slow
 def test_thrust_derivatives_both_ways(of_thrust, batch):
     k = jnp.asarray(0.1405)
 
@@ -427,3 +428,21 @@ def test_refuses_what_shooting_cannot_do(problem, words):
 def test_solve_refuses_a_bad_problem_at_once():
     with pytest.raises(ValueError, match="final_time 0.0 is not after"):
         jg.solve(FreeTime(final_time=0.0))
+
+
+@pytest.mark.parametrize("method", [SMALL, jg.PiecewiseLinear(3, starts=4)])
+@pytest.mark.parametrize(("length", "time"), [(1e-9, 1.0), (1e-4, 1e-4), (1e7, 1e3), (1.0, 1e6)])
+def test_any_units_of_smooth_problems(method, length, time):
+    """x'' = u over `length` in `time`: J = 6 length^2/time^3. Each program is compiled once."""
+    start, target = (0.0, 0.0), (jnp.asarray(length), jnp.asarray(0.0))
+    p = DoubleIntegrator(target=target, initial_state=start, final_time=jnp.asarray(time))
+    e = jg.solve(p, method)
+    # Of a polynomial that either method represents exactly, rounding remains.
+    np.testing.assert_allclose(e.objective, 6 * length**2 / time**3, rtol=1e-12)
+    assert np.all(e.certificate.passed), str(e.certificate)
+
+
+def test_a_final_time_outside_its_own_bounds_is_no_success(free_time):
+    """Shooting does not enforce the bounds of a free final time: 18^(1/4) = 2.06 is below 3."""
+    e = jg.solve(FreeTime(final_time=jg.Free(3.0, 20.0, 4.0)), SMALL, throw=False)
+    assert bool(e.result == jg.RESULTS.bounds_violated)

@@ -66,6 +66,7 @@ def test_an_optimum_that_is_linear_is_found_exactly(integrator):
     assert float(at(integrator, 0.33).u[0]) == pytest.approx(6 - 12 * 0.33, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_implicit_derivatives_and_batches():
     # x'' = k u from rest over unit distance: u = (6 - 12 t)/k, J = 6/k^2.
     method = jg.PiecewiseLinear(3, 4, starts=1)
@@ -95,6 +96,7 @@ def test_nodes_are_differentiable(launch):
 # Gains ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_gains_of_the_double_integrator(integrator):
     """The exact neighbouring control is a straight line too: K = (-6/T^2, -4/T), and at the end
     du = 6/T^2 dx + 2/T dv."""

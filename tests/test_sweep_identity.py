@@ -167,6 +167,7 @@ def test_a_docstring_in_a_plant_changes_nothing(user):
     assert manifest_of(user(*WORDS).mission()) == plain
 
 
+@pytest.mark.slow
 def test_words_in_the_package_change_nothing(user):
     """Another process, with another salt of its hashes and two devices, and a copy of the package
     that has a comment and a docstring more in every file, and another plot."""

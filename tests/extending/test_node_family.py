@@ -68,6 +68,7 @@ def solved(family, nodes, segments=1):
     return np.array([of_u, of_x, abs(float(e.objective) - 6)]), e
 
 
+@pytest.mark.slow
 def test_the_family_of_the_docstring_converges():
     """Exact to degree n - 1 only: twice the nodes, a quarter of the error of u and a sixteenth of
     those of x and J. A fifth less is allowed for terms of higher order, which fall faster."""
@@ -79,6 +80,7 @@ def test_the_family_of_the_docstring_converges():
     assert np.all(errors[-1, [0, 2]] < [16 / 24**2, 10 / 24**4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("left", "right"), [(False, True), (True, True)])
 def test_gauss_jacobi_is_exact(left, right):
     """With exponent 0 the rule is exact for all that a linear control makes."""
