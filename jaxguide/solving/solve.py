@@ -103,7 +103,7 @@ def _is_unconstrained(problem: Problem) -> bool:
     )
 
 
-def stated(problem: Problem, method: Method, guess: Any) -> tuple[Problem, Any, bool]:
+def stated(problem: Problem, method: Any, guess: Any) -> tuple[Problem, Any, bool]:
     """Problem and guess as a method takes them, once nothing is wrong with either; and whether the
     horizon has no end.
 
