@@ -300,7 +300,10 @@ def test_behaviour(contract, implementation, world):
         np.testing.assert_allclose(b[0], a, rtol=1e-12, atol=1e-12)
         assert np.all(np.isfinite(b))
     assert slope.shape == (2,) and np.all(np.isfinite(slope))
-    undefined, _, _ = everything(jnp.full(2, jnp.nan))  # a value, whatever it is
+    # A value, whatever it is. Of a method without its gradient: the implicit derivative of a root
+    # that is none asks for the solution of a singular system, which Lineax raises.
+    nan = jnp.full(2, jnp.nan)
+    undefined = jax.jit(use)(nan) if contract is jg.Method else everything(nan)[0]
     assert [a.shape for a in numbers(undefined)] == [a.shape for a in numbers(alone)]
 
 
