@@ -16,6 +16,14 @@ def bounds_of(bounds: Any, size: int, dtype: Any) -> tuple[Array, Array]:
     )
 
 
+def joined_bounds(bounds: Any, size: int, more: Any, further: int) -> tuple[Array, Array]:
+    """`bounds` of `size` components and, after them, those of the `further` ones that `more` is
+    for."""
+    parts = (bounds_of(b, k, jnp.result_type(float)) for b, k in ((bounds, size), (more, further)))
+    lower, upper = zip(*parts, strict=True)
+    return jnp.concatenate(lower), jnp.concatenate(upper)
+
+
 def overstep(values: Float[Array, "*k c"], bounds: Any) -> Float[Array, "*k c"]:
     """By how much `values` lie below their lower or above their upper bound, in their own units;
     0 within the bounds."""

@@ -102,7 +102,15 @@ ORDER: dict[str, tuple[str, ...]] = {
     ),
     "nominal.indirect": ("boundary", "coarse", "starts", "guess", "laying", "shot", "shooting"),
     "nominal.parametric": ("flow", "equality", "extremal", "piecewise_linear"),
-    "nominal.refinement": ("arcs", "layout", "meshes", "soundness", "structured", "refine"),
+    "nominal.refinement": (
+        "arcs",
+        "layout",
+        "meshes",
+        "soundness",
+        "structured",
+        "refine",
+        "ladder",
+    ),
     "neighboring": (
         "linearization",
         "collocated",
@@ -117,7 +125,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "suboptimal",
     ),
     "certificate": ("table", "along", "checks", "costly", "certify", "certified"),
-    "solving": ("diagnosis", "ladder", "solve", "batch", "bellman"),
+    "solving": ("given", "diagnosis", "solve", "batch", "bellman"),
     "laws": (
         "law",
         "lanes",

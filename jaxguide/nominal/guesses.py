@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.nominal.method import Method
-from jaxguide.problem import Problem
+from jaxguide.problem import Problem, is_endless
 from jaxguide.trajectory import Extremal
+from jaxguide.types import is_traced
 
 
 def is_key(guess: Any) -> bool:
@@ -17,9 +18,8 @@ def is_key(guess: Any) -> bool:
     return isinstance(guess, jax.Array) and jnp.issubdtype(guess.dtype, jax.dtypes.prng_key)
 
 
-def check_guess(problem: Problem, guess: Any, method: Method, without_end: bool) -> None:
-    """Refuses what `method` cannot start from. `without_end`: whether the horizon of `problem` is,
-    or may be, infinite.
+def check_guess(problem: Problem, guess: Any, method: Method) -> None:
+    """Refuses what `method` cannot start from.
 
     **Raises:** `ValueError`.
     """
@@ -27,7 +27,7 @@ def check_guess(problem: Problem, guess: Any, method: Method, without_end: bool)
     if guess is None:
         return
     if isinstance(guess, Extremal):
-        _check_extremal(problem, guess, without_end)
+        _check_extremal(problem, guess, can.endless)
         return
     if is_key(guess):
         if not can.random_start:
@@ -55,7 +55,7 @@ def check_guess(problem: Problem, guess: Any, method: Method, without_end: bool)
         )
 
 
-def _check_extremal(problem: Problem, guess: Extremal, without_end: bool) -> None:
+def _check_extremal(problem: Problem, guess: Extremal, endless: bool) -> None:
     kind = type(problem).__name__
     if guess.t.ndim != 1:
         raise ValueError(
@@ -72,7 +72,8 @@ def _check_extremal(problem: Problem, guess: Extremal, without_end: bool) -> Non
                 f"guess has {count} {what}; {kind} has {len(names)}: {names}. Give an extremal of "
                 "a problem alike, or None."
             )
-    if guess.stretch is not None and not without_end:
+    without_end = is_endless(problem) or is_traced(problem.final_time)
+    if guess.stretch is not None and not (endless and without_end):
         raise ValueError(
             f"guess runs to t = inf and {kind} ends at a finite time; give an extremal of a "
             "finite horizon, or None."

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxguide.host.compilation import compiled
-from jaxguide.problem import Problem, count, endpoint_count, is_free
+from jaxguide.problem import Problem, count, endpoint_count, is_endless
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced
 
@@ -117,8 +117,7 @@ def refuse_beyond(method: Method, problem: Problem) -> None:
             f"{kind}.integrands: {r} integral constraints, which {name} does not enforce; write "
             "each as a state with an endpoint constraint, or use jg.Pseudospectral."
         )
-    tf = problem.final_time
-    if not can.endless and not is_free(tf) and not is_traced(tf) and np.any(np.isinf(tf)):
+    if not can.endless and is_endless(problem):
         raise ValueError(
             f"{kind}.final_time is infinite; {name} needs a finite one (try some ten time "
             "constants), or use jg.Pseudospectral."

@@ -4,6 +4,7 @@ from jaxguide.problem.boundary import initial_bounds as initial_bounds
 from jaxguide.problem.boundary import initial_entries as initial_entries
 from jaxguide.problem.boundary import initial_values as initial_values
 from jaxguide.problem.boundary import initially_free as initially_free
+from jaxguide.problem.boundary import is_endless as is_endless
 from jaxguide.problem.boundary import start_control as start_control
 from jaxguide.problem.counts import count as count
 from jaxguide.problem.counts import endpoint_count as endpoint_count

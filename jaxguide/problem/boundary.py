@@ -3,10 +3,18 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of
 from jaxguide.problem.statement import Free, Problem, is_free, start_value
+from jaxguide.types import is_traced
+
+
+def is_endless(problem: Problem) -> bool:
+    """Whether its final time is infinite; False where that is traced."""
+    tf = problem.final_time
+    return not is_free(tf) and not is_traced(tf) and bool(np.any(np.isinf(np.asarray(tf))))
 
 
 def initially_free(problem: Problem) -> tuple[bool, ...]:

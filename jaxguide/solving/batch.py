@@ -11,9 +11,11 @@ from jaxguide.certificate import Certified, certified, uncertified
 from jaxguide.host.compilation import compiled
 from jaxguide.host.cores import over_cores
 from jaxguide.host.progress import Progress, metered
-from jaxguide.problem import Problem, with_array_leaves
-from jaxguide.solving.solve import default_method, on_fixed_mesh, solve, stated
+from jaxguide.problem import Problem, is_endless, with_array_leaves
+from jaxguide.solving.given import default_method, given
+from jaxguide.solving.solve import on_fixed_mesh, solve
 from jaxguide.trajectory import Extremal
+from jaxguide.transforms.endless import made_finite, opened
 from jaxguide.types import RESULTS, SolveError, is_traced, require_x64
 
 _tree = jax.tree_util.tree_map
@@ -61,14 +63,18 @@ def solve_batch(
         )
     method = default_method(batch) if method is None else method
     first = lane(batch, 0)
-    _, _, without_end = stated(first, method, lane(guess, 0) if own else guess)
+    given(first, method, lane(guess, 0) if own else guess)
     guess = uncertified(guess) if isinstance(guess, Extremal) else guess
+    axes = (0, 0 if own else None)
     if is_traced((batch, guess)):
         one = lambda p, g: solve(p, method, g, throw=False)
-        return jax.vmap(one, in_axes=(0, 0 if own else None))(batch, guess)
+        return jax.vmap(one, in_axes=axes)(batch, guess)
+    if is_endless(first):
+        one = lambda p, g: made_finite(p, g, method.time_scale)
+        batch, guess = jax.vmap(one, in_axes=axes, out_axes=axes)(batch, guess)
     # On the host, so that taking a chunk costs no dispatch.
     batch, guess = jax.device_get((batch, guess))
-    one = jax.tree_util.Partial(on_fixed_mesh, method, without_end)
+    one = jax.tree_util.Partial(on_fixed_mesh, method)
 
     def chunk(k: int) -> Extremal:
         at = np.arange(k * CHUNK, min((k + 1) * CHUNK, count))
@@ -90,7 +96,7 @@ def solve_batch(
             f"{', ...' if failed.size > 20 else ''}. Solve one with jg.solve to see why, or pass "
             "throw=False and look at .result."
         )
-    return certified(out, method.accuracy)
+    return certified(jax.vmap(opened)(out), method.accuracy)
 
 
 def _lanes_of(one: Any, problems: Problem, guess: Any, count: Any, own: bool) -> Extremal:

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.problem import Problem
-from jaxguide.solving.solve import default_method, solve
+from jaxguide.solving.given import default_method
+from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.wrapped import restated
 from jaxguide.types import RESULTS, succeeded

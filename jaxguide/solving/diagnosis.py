@@ -80,7 +80,7 @@ def _first_undefined(values: Any) -> tuple[int, int, float] | None:
 def _misses(extremal: Extremal) -> list[tuple[float, str]]:
     """The worst of each kind of constraint: its error relative to its size, and a sentence."""
     problem, t, size = extremal.problem, np.asarray(extremal.t), _sizes(extremal)
-    out = []
+    out = [_worst_defect(extremal, size)]
     e = problem.endpoint_constraints(extremal.x[0], extremal.x[-1], t[0], t[-1])
     if len(e):
         lo, hi = _sides(problem.endpoint_bounds, len(e))
@@ -116,7 +116,6 @@ def _misses(extremal: Extremal) -> list[tuple[float, str]]:
                 "time.",
             )
         )
-    out.append(_worst_defect(extremal, size))
     return out
 
 

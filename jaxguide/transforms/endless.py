@@ -6,13 +6,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jaxguide.problem import Chosen, Path, Problem, endpoint_count, is_free
+from jaxguide.problem import Chosen, Path, Problem, endpoint_count
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.transforms.wrapped import Wrapped, own_fields
-from jaxguide.types import is_traced
 
 
 class Endless(Wrapped):
@@ -60,16 +58,10 @@ class Endless(Wrapped):
         return xf if self.at_rest else own
 
 
-def is_endless(problem: Problem) -> bool:
-    """Whether its final time is infinite; False where that is traced."""
-    tf = problem.final_time
-    return not is_free(tf) and not is_traced(tf) and bool(np.any(np.isinf(np.asarray(tf))))
-
-
-def made_finite(problem: Problem, guess: Any, method: Any) -> tuple[Problem, Any]:
-    """An endless problem on [-1, 1] by `method.time_scale`, and a guess as an extremal of it."""
+def made_finite(problem: Problem, guess: Any, scale: Any) -> tuple[Problem, Any]:
+    """A problem whose final time is infinite, on [-1, 1], and a guess as an extremal of that."""
     opened_before = isinstance(guess, Extremal) and guess.stretch is not None
-    return endless(problem, method.time_scale), closed(guess) if opened_before else guess
+    return endless(problem, scale), closed(guess) if opened_before else guess
 
 
 def endless(problem: Problem, scale: Any) -> Problem:
@@ -101,8 +93,11 @@ def evened(problem: Problem) -> Problem:
 
 
 def opened(extremal: Extremal) -> Extremal:
-    """An extremal of an `Endless` problem in the user's time, its last node at t = inf."""
-    problem: Any = extremal.problem
+    """An extremal of an `Endless` problem in the user's time, its last node at t = inf; of any
+    other, as it is."""
+    problem = extremal.problem
+    if not isinstance(problem, Endless):
+        return extremal
     t = problem.clock(extremal.t)[0].at[-1].set(jnp.inf)
     rate = problem.clock(extremal.t)[1]
     rate = jnp.where(rate > 0, rate, jnp.inf)[:, None]

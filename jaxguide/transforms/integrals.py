@@ -4,16 +4,10 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import joined_bounds
 from jaxguide.problem import Problem, count, endpoint_count, initial_entries
 from jaxguide.transforms.wrapped import Wrapped, own_fields, rewrapped
-
-
-def joined_bounds(a: tuple, b: tuple) -> tuple[Array, Array]:
-    """Bounds of the components of `a` and, after them, those of `b`."""
-    return jnp.concatenate([a[0], b[0]]), jnp.concatenate([a[1], b[1]])
 
 
 class WithIntegrals(Wrapped):
@@ -46,18 +40,13 @@ class WithIntegrals(Wrapped):
 
 def with_integrals(problem: Problem) -> Problem:
     """`problem` with its integral constraints as states; `problem` itself if it has none."""
-    dtype, r = jnp.result_type(float), count(problem, "integrands")
+    r = count(problem, "integrands")
     if not r:
         return problem
-    ends = bounds_of(problem.endpoint_bounds, endpoint_count(problem), dtype)
-    states = bounds_of(problem.state_bounds, problem.n, dtype)
-    return WithIntegrals(
-        inner=problem,
-        **own_fields(
-            problem,
-            state_names=problem.state_names + tuple(f"integral {i}" for i in range(r)),
-            initial_state=(*initial_entries(problem), *(jnp.zeros((), dtype),) * r),
-            state_bounds=joined_bounds(states, bounds_of((-math.inf, math.inf), r, dtype)),
-            endpoint_bounds=joined_bounds(ends, bounds_of(problem.integral_bounds, r, dtype)),
-        ),
-    )
+    own = own_fields(problem)
+    own["state_names"] += tuple(f"integral {i}" for i in range(r))
+    own["initial_state"] = (*initial_entries(problem), *(jnp.zeros(()),) * r)
+    any_number, q = (-math.inf, math.inf), endpoint_count(problem)
+    own["state_bounds"] = joined_bounds(own["state_bounds"], problem.n, any_number, r)
+    own["endpoint_bounds"] = joined_bounds(own["endpoint_bounds"], q, problem.integral_bounds, r)
+    return WithIntegrals(inner=problem, **own)

@@ -5,9 +5,8 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import bounds_of
+from jaxguide.bounds import joined_bounds
 from jaxguide.problem import Problem
-from jaxguide.transforms.integrals import joined_bounds
 from jaxguide.transforms.wrapped import Wrapped, own_fields, rewrapped
 
 
@@ -36,12 +35,8 @@ class Relaxed(Wrapped):
 
 def relaxed(problem: Problem, delta: Float[Array, " n"]) -> Problem:
     """`problem` with its dynamics met to within `delta` (n,), in units of state per time."""
-    own = bounds_of(problem.control_bounds, problem.m, delta.dtype)
-    return Relaxed(
-        inner=problem,
-        **own_fields(
-            problem,
-            control_names=problem.control_names + tuple(f"slack {s}" for s in problem.state_names),
-            control_bounds=joined_bounds(own, (-delta, delta)),
-        ),
-    )
+    own = own_fields(problem)
+    own["control_names"] += tuple(f"slack {s}" for s in problem.state_names)
+    slack = (-delta, delta)
+    own["control_bounds"] = joined_bounds(own["control_bounds"], problem.m, slack, problem.n)
+    return Relaxed(inner=problem, **own)

@@ -1,0 +1,73 @@
+"""A solve on the host: from the guess, from random starts, up a ladder of grids, then refined."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxguide.nominal.method import Method
+from jaxguide.nominal.refinement.meshes import MeshStep
+from jaxguide.nominal.refinement.refine import refined
+from jaxguide.problem import Problem
+from jaxguide.trajectory import Extremal
+from jaxguide.types import succeeded
+
+_COARSE = 3  # segments of the mesh that is tried where the first one fails
+# How far dynamics may be missed where that one fails, in states per horizon: first choices.
+_LOOSENED = (1.0, 0.3, 0.1, 0.03)
+
+
+def on_meshes(
+    method: Method, problem: Problem, guess: Any, watch: Callable[[MeshStep], None] | None
+) -> Extremal:
+    """Solved from `guess`, from the method's random starts and up the ladder of grids, and refined.
+    By a method without a mesh, solved."""
+    best = _least_of_starts(method, problem, guess)
+    if guess is None and not succeeded(best.result) and _has_ladder(method):
+        best = _up_the_ladder(method, problem, best)
+    return refined(method, problem, best, watch) if method.capabilities.mesh else best
+
+
+def _least_of_starts(method: Any, problem: Problem, guess: Any) -> Extremal:
+    """From `guess` and from random starts, the least objective that converged."""
+    best = method.run(problem, guess)
+    for k in range(1, method.starts if method.capabilities.mesh else 1):
+        other = method.run(problem, jax.random.fold_in(jax.random.key(method.seed), k))
+        good, better = (succeeded(e.result) for e in (best, other))
+        if better and not (good and float(best.objective) <= float(other.objective)):
+            best = other
+    return best
+
+
+def _up_the_ladder(method: Any, problem: Problem, best: Extremal) -> Extremal:
+    """A coarse grid first (review, section 4.4), for fewer nodes ask less of a guess; if that fails
+    too, dynamics that may be missed by a delta that shrinks to nothing (review, Theorem 2). `best`
+    where that fails."""
+    coarse = dataclasses.replace(method, segments=_COARSE)
+    below = coarse.run(problem, None)
+    if succeeded(below.result):
+        found = method.run(problem, below)
+        return found if succeeded(found.result) else best
+    units = method.units(problem)
+    crossing = np.array([units[name] for name in problem.state_names]) / units["time"]
+    guess = None
+    for share in _LOOSENED:
+        relaxed = dataclasses.replace(coarse, relaxation=share * crossing)
+        loose = relaxed.run(problem, guess)
+        if not succeeded(loose.result):
+            break
+        guess = loose
+    if guess is None:
+        return best
+    exact = coarse.run(problem, guess)
+    found = method.run(problem, exact if succeeded(exact.result) else guess)
+    return found if succeeded(found.result) else best
+
+
+def _has_ladder(method: Any) -> bool:
+    """Whether it has a mesh that may be another one."""
+    if not method.capabilities.mesh:
+        return False
+    return bool(method.refinements) and method.fractions is None and method.segments > _COARSE
