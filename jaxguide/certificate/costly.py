@@ -2,14 +2,14 @@
 
 import diffrax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Checks
+from jaxguide.linalg import power_of_two
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, solve_sweeps
 from jaxguide.neighboring.sufficiency import conjugate_ahead
-from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 
 
@@ -17,7 +17,7 @@ def propagation(rows: Checks, a: Along) -> None:
     """Its states against those of the interpolated control, and conjugate points."""
     extremal = a.extremal
     problem, t = extremal.problem, extremal.t
-    gap = (_propagate(extremal) - extremal.x) / a.size.x[None]
+    gap = (_propagate(extremal, a.size.x) - extremal.x) / a.size.x[None]
     rows.add("propagated state", problem.state_names, gap, t, 1e-8)
     # The last break with one ahead is just before it: 1 there, 0 where there is none.
     ahead = _conjugate(extremal)
@@ -26,24 +26,26 @@ def propagation(rows: Checks, a: Along) -> None:
     rows.add_signed("conjugate points", ("one follows",), count, extremal.breaks[last], 0.0)
 
 
-def _propagate(extremal: Extremal) -> Array:
-    """States flown from x(t0) with the interpolated control, at the nodes."""
-    problem: Problem = extremal.problem
-    rate = lambda t, x, args: problem.dynamics(t, x, extremal.interpolate(extremal.u, t))
+def _propagate(extremal: Extremal, size: Float[Array, " n"]) -> Float[Array, "node n"]:
+    """States flown from x(t0) with the interpolated control, at the nodes. The integrator works in
+    units of their `size`, as powers of two, so that its tolerance has none of the user's."""
+    problem, unit = extremal.problem, power_of_two(size)
+    control = lambda t: extremal.interpolate(extremal.u, t)
+    rate = lambda t, y, args: problem.dynamics(t, y * unit, control(t)) / unit
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rate),
         diffrax.Dopri8(),
         extremal.t[0],
         extremal.t[-1],
         None,
-        extremal.x[0],
+        extremal.x[0] / unit,
         stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
         saveat=diffrax.SaveAt(ts=extremal.t),
         max_steps=16384,
         throw=False,
     )
     assert solution.ys is not None
-    return solution.ys
+    return solution.ys * unit[None]
 
 
 def _conjugate(extremal: Extremal) -> Bool[Array, " break"]:

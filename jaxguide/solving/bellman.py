@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxguide.linalg import power_of_two
 from jaxguide.problem import Problem
 from jaxguide.solving.given import default_method
 from jaxguide.solving.solve import solve
@@ -79,13 +80,14 @@ def bellman(problem: Problem, method: Any = None, segments: int = 4, guess: Any 
 
 @jax.jit
 def _flown(extremal: Extremal, x: Array, t0: Array, t1: Array) -> tuple[Array, Array]:
-    """State and cost at `t1`, flown with the extremal's control from `x` at `t0`."""
-    problem = extremal.problem
+    """State and cost at `t1`, flown with the extremal's control from `x` at `t0`, in units of their
+    sizes along it."""
+    problem, size = extremal.problem, extremal.sizes()
+    unit = power_of_two(jnp.append(size.x, size.cost))
 
     def rate(t: Any, y: Array, args: Any) -> Array:
-        u = extremal.point(t).u
-        cost = problem.running_cost(t, y[:-1], u)
-        return jnp.append(problem.dynamics(t, y[:-1], u), cost)
+        x, u = (y * unit)[:-1], extremal.point(t).u
+        return jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u)) / unit
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rate),
@@ -93,13 +95,13 @@ def _flown(extremal: Extremal, x: Array, t0: Array, t1: Array) -> tuple[Array, A
         t0,
         t1,
         None,
-        jnp.append(x, 0.0),
+        jnp.append(x, 0.0) / unit,
         stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
         max_steps=16384,
         throw=False,
     )
     assert solution.ys is not None
-    y = solution.ys[-1]
+    y = solution.ys[-1] * unit
     return y[:-1], y[-1]
 
 
