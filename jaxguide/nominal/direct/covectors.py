@@ -179,7 +179,7 @@ def _result(
 
 
 def _undecided(limits: Limits, solution: interior_point.Solution) -> Bool[Array, ""]:
-    """Whether the distance of a bound and its multiplier, whose product is the barrier mu, are both
+    """Whether the distance to a bound and its multiplier, whose product is the barrier mu, are both
     within a factor of `_WEAK` of sqrt(mu): there the barrier's derivative is off by a hundredth or
     more."""
     box = Box(*map(flattened, boxed(limits)))

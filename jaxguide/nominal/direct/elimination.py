@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Int
 from jaxguide.nominal.direct.newton_system import COMPLIANCE, NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 
-# Barrier curvature that stands for a given control. A choice: the square root of it, by which the
-# control's column is divided, is 1e8, so that the control moves by rounding alone.
+# Barrier curvature that stands for a given control. Chosen, not tuned: its square root, by which
+# the control's column is divided, is 1e8, so that the control moves by rounding alone.
 _STIFF = 1e16
 
 

@@ -23,15 +23,16 @@ from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Counts
 
 # Curvature of the penalty on the final state's gap in the sweep, relative to the Hessian's largest
-# entry. A choice: it need only make the sweep convex, as the multiplier beside it closes the gap.
+# entry. Chosen, not tuned: it need only make the sweep convex; the multiplier beside it closes the
+# gap.
 PENALTY = 1e2
 # Softness lent to the multipliers of the last system, relative to its largest entries, so that a
-# redundant constraint does not make it singular. A choice, some 1e5 roundings: refinement takes it
-# out again.
+# redundant constraint does not make it singular. Chosen, not tuned: some 1e5 roundings, which
+# refinement takes out again.
 _SOFT = 1e-11
 _LEAST_SIZE = 1e-300  # of a row of the last system, lest a row of zeros be divided by zero
-# Least barrier curvature of an endpoint slack, so that its inverse, the flexibility, is finite: far
-# below any that the barrier gives (a choice).
+# Least barrier curvature of an endpoint slack, so that its inverse, the flexibility, is finite.
+# Chosen, not tuned: far below any that the barrier gives.
 _LEAST_CURVATURE = 1e-12
 
 

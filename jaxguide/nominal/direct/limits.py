@@ -11,8 +11,8 @@ from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
 from jaxguide.problem import initial_bounds, initial_values, initially_free, is_free, parameters
 
-# Least distance of successive free knots, as a share of the horizon's unit. A choice: far below any
-# arc that matters, far above the rounding of times.
+# Least distance of successive free knots, as a share of the horizon's unit. Chosen, not tuned: far
+# below any arc that matters, far above the rounding of times.
 _APART = 1e-6
 
 _Side = tuple[Array, Array]  # lower, upper
