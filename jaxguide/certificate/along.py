@@ -1,4 +1,4 @@
-"""An extremal as the checks look at it: at its nodes, and on Gauss points between them."""
+"""What the checks evaluate: an extremal at its nodes, and at Gauss points between them."""
 
 from collections.abc import Callable
 

@@ -12,7 +12,7 @@ from jaxguide.trajectory import Extremal
 
 
 class Certified(Extremal):
-    """An Extremal that knows how accurate its method means to be, and so how to be judged.
+    """An Extremal with the accuracy that its method aims at.
 
     `accuracy`: the relative error up to which a row of its certificate passes.
     """

@@ -9,9 +9,12 @@ from jaxtyping import Array, Float
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import Problem, with_parameters
 
-REST = 1e-8  # a value below it is at rest at zero (a choice: a root of rounding, in any usual unit)
-# Orders of magnitude from 1 at which an unknown's size, estimated from the dynamics, is used. A
-# choice: an estimate is off by a factor of ten or more, and a unit need not be closer than that.
+# A value below it is at rest at zero: the square root of rounding, in the user's unit. Chosen, not
+# tuned.
+REST = 1e-8
+# Orders of magnitude from 1 at which an unknown's size, estimated from the dynamics, is used. An
+# estimate is off by a factor of ten or more, and a unit need not be closer than that. Chosen, not
+# tuned.
 _FAR = 3
 
 

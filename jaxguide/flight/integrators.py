@@ -65,7 +65,7 @@ class StagedIntegrator(Integrator):
 
 
 class RungeKutta4(StagedIntegrator):
-    """The classical fourth-order method, `steps` equal steps a sample. Made for batches.
+    """The classical fourth-order method, `steps` equal steps a sample; fast in batches.
 
     **Error:** of fourth order in the sample interval over `steps`.
 

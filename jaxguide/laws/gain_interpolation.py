@@ -68,7 +68,7 @@ class TimeToGoGains(Interpolation):
         scale = jax.vmap(left)(stations)[:, None, :]
         blend = _blend(stations, jnp.minimum(tau, last))
         # A time to go below a thousandth of the last station's counts as that much, so that no gain
-        # is infinite (the fraction is a choice; a flight is then as good as over).
+        # is infinite. Chosen, not tuned: a flight is then as good as over.
         least = (1 - last) * 1e-3
         now = left(jnp.maximum(1 - tau, least) * -1 + 1)[None, :]
         time = (1 - stations)[:, None] * schedule.K_time

@@ -15,11 +15,12 @@ from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal, Point
 
-SEGMENTS, NODES, SWEEPS = 72, 8, 8  # the defaults: some 1e-9 where a control turns sharply
-_FINER = 2  # Gauss points more in the finer sweep
-# Picard sweeps of the finer one. It starts from the coarser solution, so that few show the
-# difference; by experiment.
-_FINER_SWEEPS = 5
+# The defaults: gains of Earth-Mars, whose control turns sharply, to 4e-10 up to t = 3.2 of 3.3
+# (`bench/gains.py`).
+SEGMENTS, NODES, SWEEPS = 72, 8, 8
+# Gauss points more in the finer sweep (chosen, not tuned), and its Picard sweeps: starting from the
+# coarser solution, few show the difference (by experiment, on what is not recorded).
+_FINER, _FINER_SWEEPS = 2, 5
 
 
 @functools.partial(jax.jit, static_argnames="parameters")

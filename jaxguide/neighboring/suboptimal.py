@@ -17,9 +17,9 @@ from jaxguide.problem import is_free
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced, require_x64
 
-# Least pivot of the Gram matrix of unit constraint rows below which they count as dependent. Pivots
-# are squares of sines: rows that differ by an angle of 3e-5 count as independent, and rounding
-# leaves 1e-15: a choice between the two.
+# Pivot of the Gram matrix of unit constraint rows below which they count as dependent. Pivots are
+# squares of sines, of which rounding leaves 1e-15: rows that differ by an angle above 3e-5 count as
+# independent. Chosen, not tuned.
 _RANK = 1e-9
 
 

@@ -19,7 +19,8 @@ from jaxtyping import Array, Float
 
 from jaxguide.spectral import interpolation_matrix, nodes_lg
 
-# Segments joined without making the rows orthonormal in between: growth over so few is harmless.
+# Segments joined without making the rows orthonormal in between: they grow little over so few.
+# Chosen, not tuned.
 GROUP = 8
 
 

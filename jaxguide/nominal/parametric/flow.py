@@ -1,5 +1,8 @@
-"""A control as parameters: piecewise linear in normalised time, with the final time (thesis, eqs
-2.5-2.13). What they lead to, from the start or from anywhere on the way."""
+"""A control as parameters, the values at its nodes and the final time, and the trajectory that they
+give, from the start or from anywhere on the way. Linear between nodes, in normalised time.
+
+**Source:** Libby's thesis, eqs (2.5)-(2.13).
+"""
 
 from typing import Any, NamedTuple
 
@@ -25,7 +28,7 @@ class Departure(NamedTuple):
 
 
 def pack(problem: Problem, controls: Float[Array, "k m"], tf: Any) -> Float[Array, " p"]:
-    """a = (u_1, ..., u_k, tf), eq. (2.9); without tf where it is given."""
+    """a = (u_1, ..., u_k, tf), thesis, eq. (2.9); without tf where it is given."""
     flat = controls.reshape(-1)
     return jnp.append(flat, tf) if is_free(problem.final_time) else flat
 
@@ -40,7 +43,8 @@ def unpack(problem: Problem, a: Float[Array, " p"]) -> tuple[Float[Array, "k m"]
 def control_at(
     positions: Float[Array, " k"], controls: Float[Array, "k m"], tau: Any
 ) -> Float[Array, " m"]:
-    """The control at the scalar `tau`, eqs (4.30)-(4.31); past the ends the last slope goes on."""
+    """The control at the scalar `tau`, thesis, eqs (4.30)-(4.31); beyond the ends, the line of the
+    nearest interval."""
     i = interval(positions, tau)
     share = (tau - positions[i]) / (positions[i + 1] - positions[i])
     return controls[i] + share * (controls[i + 1] - controls[i])
@@ -78,7 +82,7 @@ def fly(
             t, u = begin + span * (tau - start.tau + width * s), left + s * (right - left)
             x = y[:-1]
             rates = jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
-            return width * span * rates  # eq. (2.7)
+            return width * span * rates  # thesis, eq. (2.7)
 
         ys = dopri8(rate, y, points)
         return ys[-1], ys
@@ -95,8 +99,8 @@ def outcome(
     start: Departure,
     degree: int,
 ) -> tuple[Float[Array, ""], Float[Array, " q"], Float[Array, " n"]]:
-    """Cost and endpoint constraints (less their targets) from `start` on, eqs (2.12)-(2.13); and
-    the state at the end."""
+    """Cost and endpoint constraints (less their targets) from `start` on, and the state at the end:
+    thesis, eqs (2.12)-(2.13)."""
     end = fly(problem, positions, a, start, degree)[-1, -1]
     t0 = jnp.asarray(problem.initial_time, a.dtype)
     span = unpack(problem, a)[1] - t0
