@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
+from jaxguide.spectral import interval
 
 
 class StationGains(NamedTuple):
@@ -86,7 +87,6 @@ def _blend(stations: Float[Array, " g"], tau: Any) -> Any:
     two after them. Returns a function of the values at the stations."""
     if stations.shape[0] == 1:
         return lambda values: values[0]
-    after = jnp.searchsorted(stations, tau, side="right", method="compare_all")
-    i = jnp.clip(after - 1, 0, stations.shape[0] - 2)
+    i = interval(stations, tau)
     share = (tau - stations[i]) / (stations[i + 1] - stations[i])
     return lambda values: values[i] + share * (values[i + 1] - values[i])

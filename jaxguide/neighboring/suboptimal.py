@@ -14,6 +14,7 @@ from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, polished
 from jaxguide.problem import is_free
+from jaxguide.spectral import interval
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced, require_x64
 
@@ -56,7 +57,7 @@ class SuboptimalSchedule(eqx.Module):
 
     def state(self, tau: Any) -> Float[Array, " n"]:
         """The nominal state at the scalar `tau`; beyond the ends, its polynomial goes on."""
-        i = par.interval(self.positions, tau)
+        i = interval(self.positions, tau)
         a, b = self.positions[i], self.positions[i + 1]
         local, terms = (2 * tau - a - b) / (b - a), self.polynomials[i]
         value = terms[0]
@@ -221,7 +222,7 @@ def _schedule(
     K_time = K[:, -1] if free else jnp.zeros((stations.shape[0], n), K.dtype)
     K = K[:, : k * m].reshape(-1, k, m, n)
     controls = par.unpack(problem, a)[0]
-    first = jax.vmap(lambda tau: par.interval(positions, tau))(stations)
+    first = jax.vmap(lambda tau: interval(positions, tau))(stations)
     at = lambda i: jax.vmap(lambda K, i: K[i])(K, i)
     points = extremal.reference_nodes
     exponents = jnp.arange(points.shape[0] - 1, -1, -1).astype(points.dtype)
@@ -311,7 +312,7 @@ def _optimum(
     parameters belong to it: those of nodes not yet passed."""
     problem, m = extremal.problem, extremal.problem.m
     k = positions.shape[0]
-    first = par.interval(positions, tau)
+    first = interval(positions, tau)
     order = jnp.arange(k, dtype=first.dtype)
     active = jnp.repeat(order >= first, m)
     if is_free(problem.final_time):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxguide.bounds import bounds_of
 from jaxguide.nominal.steps import dopri8
 from jaxguide.problem import Problem, initial_values, is_free
-from jaxguide.spectral import nodes_lgl
+from jaxguide.spectral import interval, nodes_lgl
 
 
 class Departure(NamedTuple):
@@ -50,12 +50,6 @@ def control_at(
     return controls[i] + share * (controls[i + 1] - controls[i])
 
 
-def interval(positions: Float[Array, " k"], tau: Any) -> Array:
-    """Index of the interval that holds `tau`; of the nearest one beyond the ends."""
-    after = jnp.searchsorted(positions, tau, side="right", method="compare_all")
-    return jnp.clip(after - 1, 0, positions.shape[0] - 2)
-
-
 def fly(
     problem: Problem,
     positions: Float[Array, " k"],
@@ -68,10 +62,8 @@ def fly(
     Intervals that begin before `start` begin there instead, with their control: the parameter of
     the last node passed is then the control at `start`, and earlier ones do nothing.
     """
-    controls, tf = unpack(problem, a)
-    t0 = jnp.asarray(problem.initial_time, a.dtype)
-    span = tf - t0
-    begin = t0 + start.tau * span if start.t is None else start.t
+    controls, _ = unpack(problem, a)
+    _, span, begin = _clock(problem, a, start)
     positions = jnp.maximum(positions, start.tau)
     points = jnp.asarray((nodes_lgl(degree + 1)[0] + 1) / 2, a.dtype)
 
@@ -92,6 +84,13 @@ def fly(
     return jax.lax.scan(across, y, parts)[1]
 
 
+def _clock(problem: Problem, a: Float[Array, " p"], start: Departure) -> tuple[Array, Array, Array]:
+    """t0, the length of the whole horizon, and the time of `start`."""
+    t0 = jnp.asarray(problem.initial_time, a.dtype)
+    span = unpack(problem, a)[1] - t0
+    return t0, span, t0 + start.tau * span if start.t is None else start.t
+
+
 def outcome(
     problem: Problem,
     positions: Float[Array, " k"],
@@ -102,9 +101,7 @@ def outcome(
     """Cost and endpoint constraints (less their targets) from `start` on, and the state at the end:
     thesis, eqs (2.12)-(2.13)."""
     end = fly(problem, positions, a, start, degree)[-1, -1]
-    t0 = jnp.asarray(problem.initial_time, a.dtype)
-    span = unpack(problem, a)[1] - t0
-    begin = t0 + start.tau * span if start.t is None else start.t
+    t0, span, begin = _clock(problem, a, start)
     ends = (initial_values(problem, a.dtype), end[:-1], t0, begin + (1 - start.tau) * span)
     e = problem.endpoint_constraints(*ends)
     e = e - bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)[0]
