@@ -1,4 +1,4 @@
-"""What the checks evaluate: an extremal at its nodes, and at Gauss points between them."""
+"""An extremal evaluated for the checks: at its nodes, and at Gauss points between them."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from jaxguide.trajectory import Extremal
 
 
 class Along:
-    """What several checks share, computed while they are traced."""
+    """Values that several checks share, computed while they are traced."""
 
     def __init__(self, extremal: Extremal):
         self.extremal, self.size = extremal, extremal.sizes()

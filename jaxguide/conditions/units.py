@@ -40,9 +40,9 @@ def natural_units(
     """A unit for each state and control, of the order of its values, in user units.
 
     It is a bound or a value where one is known. Otherwise it is 1, unless the dynamics show that
-    the size is another by orders of magnitude. They give the size of an unknown from those of its
-    neighbours: what moves a state of known size by as much within the horizon, or how far a state
-    is moved by what is known.
+    the size is another by orders of magnitude. They relate sizes: an unknown is as large as it must
+    be to move a state of known size by as much within the horizon, or as far as quantities of known
+    size move it.
 
     **Arguments:** a guess in user units: `times`, of which the first two are t0 and tf; `x0`, the
     state at t0; `x`, the states after the first point of each segment, the last at its end; `u`,

@@ -50,7 +50,7 @@ def sample_count(
 
     **Raises:** `ValueError` for an interval or a number of samples that does not fit.
     """
-    # What was given decides: under a trace, even a number becomes a tracer once it is an array.
+    # Asked of the arguments as given: under a trace, even a number becomes a tracer as an array.
     traced = is_traced((interval, ends))
     if jnp.ndim(interval):
         max_samples = _one_length_each(law, interval, None if traced else ends, dtype, max_samples)

@@ -22,7 +22,7 @@ _DISTURBANCE = 2**32 - 2
 
 
 class Memories(NamedTuple):
-    """What each part of the loop remembers; None of a part that is absent or has no memory."""
+    """The memory of each part of the loop; None of a part that is absent or has none."""
 
     law: Any
     hold: Any

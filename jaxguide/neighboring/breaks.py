@@ -18,7 +18,7 @@ _HALVINGS = 12
 # hard constraints make the gain a ratio of small differences there. Chosen, no experiment is
 # recorded.
 _LAST = 2.0**-17
-# Segments per e-fold of the time left; by experiment, on what is not recorded.
+# Segments per e-fold of the time left; by experiment, on which problems is not recorded.
 _GRADING = 0.8
 # Added to the density of segments, `_EVEN` over the horizon and `_SHARE` of its mean: segments do
 # not grow without limit where nothing happens. By experiment on the library.

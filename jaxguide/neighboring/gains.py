@@ -203,7 +203,8 @@ def _judged(
 
 
 # Distance, as a share of a quantity's size along the extremal, at which it counts as on its bound:
-# far above what an interior-point method's last barrier, 1e-10, leaves there. Chosen, not tuned.
+# far above the distance that an interior-point method's last barrier, 1e-10, leaves. Chosen, not
+# tuned.
 _ON_BOUND = 1e-6
 
 

@@ -15,11 +15,10 @@ from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal, Point
 
-# The defaults: gains of Earth-Mars, whose control turns sharply, to 4e-10 up to t = 3.2 of 3.3
-# (`bench/gains.py`).
+# The defaults: gains of Earth-Mars, whose control turns sharply, to 4e-10 (`bench/gains.py`).
 SEGMENTS, NODES, SWEEPS = 72, 8, 8
 # Gauss points more in the finer sweep (chosen, not tuned), and its Picard sweeps: starting from the
-# coarser solution, few show the difference (by experiment, on what is not recorded).
+# coarser solution, few show the difference (by experiment; on which problems is not recorded).
 _FINER, _FINER_SWEEPS = 2, 5
 
 

@@ -71,7 +71,7 @@ class SuboptimalSchedule(eqx.Module):
 
 
 class Sensitivities(NamedTuple):
-    """Derivatives of what follows each station, by the state x there and by the parameters a.
+    """Derivatives of the trajectory after each station, by the state x there and the parameters a.
 
     G = J + nu^T psi is the augmented cost: thesis, eq. (3.1).
     """
@@ -300,7 +300,7 @@ def _dependence(D: Float[Array, "q p"]) -> Float[Array, ""]:
 def _remaining(
     extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
 ) -> tuple[Sensitivities, Array]:
-    """Derivatives at the optimum of what follows `tau`."""
+    """Derivatives of the trajectory after `tau`, at its own optimum."""
     z, active = _optimum(extremal, positions, a, nu, tau, x)
     return _derivatives(extremal, positions, z.a, z.nu, tau, x, False), active
 

@@ -24,7 +24,7 @@ _RELAX = 1e-9
 
 
 class Box(NamedTuple):
-    """Bounds and what follows from them.
+    """Bounds, and which entries have them.
 
     - `below`, `above`: bool, whether an entry has a lower, an upper bound and may move.
     - `given`: bool, whether both bounds coincide, so that the entry may not move.

@@ -51,7 +51,7 @@ def over_segments(f: Any, items: Any) -> Any:
 
 
 def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
-    """The null space of the defects, and what is left of the quadratic on it.
+    """The null space of the defects, and the quadratic restricted to it.
 
     The LU is stable however unstable the dynamics are; following the states from their start would
     not be. Pivoting, over states and controls alike, makes those entries basic that the defects

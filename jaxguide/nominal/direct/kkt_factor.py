@@ -72,7 +72,7 @@ class SweepStage(NamedTuple):
 class Factor(NamedTuple):
     """The factorised matrix: everything that a right-hand side needs.
 
-    - `W`: see Segments, regularised. `delta`: what was added to the Hessian's diagonal.
+    - `W`: see Segments, regularised. `delta`: added to the Hessian's diagonal.
     - `rho`: curvature of the penalty on the final state's gap in the sweep.
     - `eigenvalues`, `vectors`, `equilibrium`, `K`: the system of the globals, scaled by
       `equilibrium`. `held`: which of them may not move.

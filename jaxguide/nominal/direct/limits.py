@@ -89,8 +89,8 @@ def _time_bounds(program: Transcription) -> list[_Side]:
 def _on_arcs(
     program: Transcription, x: list[Array], u: list[Array], h: list[Array]
 ) -> tuple[list[Array], list[Array], list[Array]]:
-    """Bounds of states, controls and path constraints, changed by what is known of each arc: held
-    controls are given, and the states and path constraints that they determine are unbounded."""
+    """Bounds of states, controls and path constraints on arcs: held controls are given, and the
+    states and path constraints that they determine are unbounded."""
     assert program.arcwise is not None
     at = program.arcwise.held[:, None]
     u = [jnp.where(at > 0, u[1], u[0]), jnp.where(at < 0, u[0], u[1])]

@@ -76,7 +76,7 @@ class Counts(NamedTuple):
 
 
 class Arcwise(eqx.Module):
-    """What is known of the arc that each segment is part of.
+    """The known structure of the arc that each segment is part of.
 
     - `held`: 1 or -1 where a control is to stay at its upper or lower bound, 0 elsewhere. The sign
       of its multiplier tells whether it should.

@@ -187,7 +187,7 @@ class PiecewiseLinear(Method):
 
 
 class Units(NamedTuple):
-    """What parameters, cost and constraints are measured in."""
+    """Units of parameters, cost and constraints."""
 
     a: Float[Array, " p"]
     f: Float[Array, ""]

@@ -40,7 +40,7 @@ _IDLE = 1e-3
 
 
 class Matrix(NamedTuple):
-    """The Newton matrix, factorised. `delta`: what its Hessian was regularised by; `regular`:
+    """The Newton matrix, factorised. `delta`: its Hessian's regularisation; `regular`:
     whether its inertia is right; `needed`: the last positive delta that a Newton step needed."""
 
     system: NewtonSystem
@@ -107,7 +107,7 @@ def _corrected(
     factorise_with: Any, first: Array, last: Array
 ) -> tuple[Array, Factor, Bool[Array, ""]]:
     """Regularisation from `first` up, until the inertia is right: Waechter & Biegler (2006),
-    Algorithm IC. `last`: what was needed before, or 0."""
+    Algorithm IC. `last`: the last one that was needed, or 0."""
 
     def attempt(carry: tuple) -> tuple:
         delta, _, _ = carry

@@ -41,7 +41,7 @@ _SHRINK = 0.5
 
 
 class Search(NamedTuple):
-    """What stays fixed while lengths are tried. `theta`: violation, the 1-norm of the constraints;
+    """Fixed while lengths are tried. `theta`: violation, the 1-norm of the constraints;
     `logs`: the barrier function with mu = 1 and no objective."""
 
     setup: Setup
@@ -79,7 +79,7 @@ class Aim(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the search ends with: the barrier and its filter, the uncorrected step, the step taken
+    """The result of the search: the barrier and its filter, the uncorrected step, the step taken
     and its length, violation `theta` and barrier function `phi` before it, whether it is
     `accepted`, and as an f-type step; `regular`: whether the step could be computed at all."""
 

@@ -1,4 +1,4 @@
-"""The next state: the new iterate, its bounds' multipliers, and what kind of step comes next."""
+"""The next state: the new iterate, its bounds' multipliers, and the kind of the next step."""
 
 from typing import NamedTuple
 
@@ -52,8 +52,8 @@ class Moved(NamedTuple):
 
 
 class Restoration(NamedTuple):
-    """What a step means for feasibility restoration: whether it is over (`home`), must begin
-    (`into`), or failed (`stuck`)."""
+    """Whether a step ended feasibility restoration (`home`), makes it necessary (`into`), or failed
+    in it (`stuck`)."""
 
     home: Bool[Array, ""]
     into: Bool[Array, ""]
