@@ -48,7 +48,7 @@ class Along:
         return jax.vmap(jax.vmap(lambda *at: f(of, *at)))(*self.between)
 
     def integrals(self, values: Float[Array, "segment gauss *k"]) -> Float[Array, "segment *k"]:
-        """Over each segment."""
+        """The integral over each segment, from `values` at its Gauss points."""
         sums = jnp.einsum("g,sg...->s...", self.weights, values)
         return self.half.reshape(-1, *(1,) * (sums.ndim - 1)) * sums
 
@@ -58,6 +58,6 @@ class Along:
         return e.x[0], e.x[-1], e.t[0], e.t[-1]
 
     def endpoint_gradient(self) -> tuple[Array, Array, Array, Array]:
-        """Of Ebar with respect to `ends`."""
+        """Gradient of Ebar by each of `ends`."""
         g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))
         return g(self.extremal.problem, self.extremal.multipliers.endpoint, *self.ends())

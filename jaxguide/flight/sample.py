@@ -85,7 +85,7 @@ def _is_random(part: Sensor | Disturbance | None) -> bool:
 
 
 def _keys(mission: Mission, key: Any, k: Any) -> tuple[Any, Any]:
-    """Of the sensor and of the disturbance at sample k; None where it is not random."""
+    """Keys of the sensor and of the disturbance at sample k; None for one that is not random."""
     sensor = disturbance = None
     if _is_random(mission.sensor):
         sensor = jax.random.fold_in(key, k)

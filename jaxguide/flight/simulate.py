@@ -139,8 +139,8 @@ def _through_samples(
 
 
 class Clock(eqx.Module):
-    """Of a flight whose end its law decides: the time, whether the sample under way is meant to be
-    the last, and whether the end was reached."""
+    """The clock of a flight whose end its law decides: the time, whether the sample under way is
+    meant to be the last, and whether the end was reached."""
 
     t: Float[Array, ""]
     ending: Bool[Array, ""]

@@ -98,7 +98,7 @@ def _transitions(
     fine_times: Float[Array, "f segment"],
     sweeps: int,
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Of both systems: the slopes (Phi - I)/(t_e - t) at the finer Gauss points, and the
+    """For both systems, the slopes (Phi - I)/(t_e - t) at the finer Gauss points, and the
     transitions across the segments."""
     widths = jnp.diff(breaks)
     eye = identity((coarse.shape[1], coarse.shape[2]), coarse.dtype)[None, :, :, None]

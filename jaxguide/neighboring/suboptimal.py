@@ -244,7 +244,7 @@ def _schedule(
 
 
 def _parameter_sizes(extremal: Extremal, k: int) -> Float[Array, " p"]:
-    """How large each parameter is along the nominal: k controls a node, and a free duration."""
+    """How large each parameter is along the nominal: the controls of k nodes, a free duration."""
     problem = extremal.problem
     sizes = jnp.tile(size_along(extremal.u, problem.control_bounds), k)
     return (

@@ -82,7 +82,7 @@ def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
 def _null_space(
     program: Transcription, diagonal: Array, jacobian: Array, weight: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Of one segment: `basis`, `order`, `place` of Segments, and (x, u) from v."""
+    """`basis`, `order` and `place` of one segment, see Segments, and (x, u) from v."""
     rule, n, m, C = program.rule, program.counts.n, program.counts.m, program.counts.nodes
     dtype = weight.dtype
     B = jnp.asarray(rule.B, dtype)

@@ -37,8 +37,8 @@ _LEAST_CURVATURE = 1e-12
 
 
 class SweepLayout(NamedTuple):
-    """Where the parameters theta = (start, times, p, xf, lambda_f) of the sweep lie, and where the
-    globals that move freely, (x0, times, p), end. lambda_f is the multiplier of the final state.
+    """Slices of the sweep's parameters theta = (start, times, p, xf, lambda_f), lambda_f being the
+    multiplier of the final state; `moving`: how many of the first move freely, (x0, times, p).
     """
 
     start: slice

@@ -40,8 +40,8 @@ class _Particular(NamedTuple):
 
 
 class _Sweep(NamedTuple):
-    """Of the backward sweep: the linear part of the value at the start, the z of each segment at
-    theta = 0, negated, and the linear part of the value after each segment."""
+    """The backward sweep's results: the linear part of the value at the start, minus the z of each
+    segment at theta = 0, and the linear part of the value after each segment."""
 
     p: Float[Array, " theta"]
     k: Float[Array, "segment z"]

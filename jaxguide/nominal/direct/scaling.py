@@ -44,7 +44,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     )
 
     def slopes(w: Primal) -> tuple[Array, Array, Array]:
-        """Of path constraints, endpoint cost and constraints, and running cost."""
+        """Largest slopes of path constraints, endpoint cost and constraints, and running cost."""
         nodes, ends = program.derivatives(w)
         path = steepest(nodes.jacobian[:, :, n + 1 :], (0, 1, 3))
         return path, steepest(ends.jacobian, 1), steepest(nodes.jacobian[:, :, n] / weights, None)

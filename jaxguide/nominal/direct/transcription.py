@@ -83,7 +83,7 @@ class Transcription(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """Of every floating number in the program."""
+        """The type of every floating number in the program."""
         return self.edges.dtype
 
     @property

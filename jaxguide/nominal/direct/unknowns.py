@@ -55,7 +55,7 @@ class Scale(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How many of each a transcription has.
+    """Numbers of unknowns and equations of a transcription.
 
     - `n`, `m`: states, controls. `parameters`: optimised static parameters.
     - `path`, `end`: path constraints at a node; endpoint constraints, the order of free times

@@ -52,7 +52,7 @@ class Matrix(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Of the objective, and of the barrier with mu = 1."""
+    """Gradients of the objective, and of the barrier with mu = 1."""
 
     objective: Float[Array, " unknown"]
     barrier: Float[Array, " unknown"]
@@ -66,7 +66,7 @@ class Move(NamedTuple):
 
 
 def gradients_of(setup: Setup, at: Iterate) -> Gradients:
-    """Both gradients at an iterate."""
+    """The Gradients at an iterate."""
     program, w = setup.program, setup.program.shaped(at.state.w)
     of = lagrangian_gradient(program, at.nodes, at.ends, w, zeros_like(at.state.y))
     pull = barrier_gradient(setup.box, at.low, at.high, jnp.ones_like(at.state.mu))

@@ -54,8 +54,8 @@ class Search(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Of a trial point: whether it is acceptable; whether as a step of f-type, which decreases the
-    barrier function and leaves the filter as it is; its constraints and violation."""
+    """Whether a trial point is acceptable; whether as a step of f-type, which decreases the barrier
+    function and leaves the filter as it is; the point's constraints and violation."""
 
     ok: Bool[Array, ""]
     f_type: Bool[Array, ""]
