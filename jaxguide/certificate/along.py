@@ -1,4 +1,4 @@
-"""An extremal as the checks look at it: at its nodes, and on Gauss points between them."""
+"""An extremal evaluated for the checks: at its nodes, and at Gauss points between them."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from jaxguide.trajectory import Extremal
 
 
 class Along:
-    """What several checks share, computed while they are traced."""
+    """Values that several checks share, computed while they are traced."""
 
     def __init__(self, extremal: Extremal):
         self.extremal, self.size = extremal, extremal.sizes()
@@ -48,7 +48,7 @@ class Along:
         return jax.vmap(jax.vmap(lambda *at: f(of, *at)))(*self.between)
 
     def integrals(self, values: Float[Array, "segment gauss *k"]) -> Float[Array, "segment *k"]:
-        """Over each segment."""
+        """The integral over each segment, from `values` at its Gauss points."""
         sums = jnp.einsum("g,sg...->s...", self.weights, values)
         return self.half.reshape(-1, *(1,) * (sums.ndim - 1)) * sums
 
@@ -58,6 +58,6 @@ class Along:
         return e.x[0], e.x[-1], e.t[0], e.t[-1]
 
     def endpoint_gradient(self) -> tuple[Array, Array, Array, Array]:
-        """Of Ebar with respect to `ends`."""
+        """Gradient of Ebar by each of `ends`."""
         g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))
         return g(self.extremal.problem, self.extremal.multipliers.endpoint, *self.ends())

@@ -12,7 +12,7 @@ from jaxguide.trajectory import Extremal
 
 
 class Certified(Extremal):
-    """An Extremal that knows how accurate its method means to be, and so how to be judged.
+    """An Extremal with the accuracy that its method aims at.
 
     `accuracy`: the relative error up to which a row of its certificate passes.
     """
@@ -21,8 +21,8 @@ class Certified(Extremal):
 
     @property
     def certificate(self) -> Certificate:
-        """How good this extremal is: every check, computed when asked for. Of a batch, as from
-        `jg.solve_batch`, with a leading axis of lanes. With costly rows: `jg.certify`."""
+        """The checks of this extremal, computed at each access; of a batch (`jg.solve_batch`) with
+        a leading axis of lanes. `jg.certify` also has the costly ones."""
         one = lambda extremal: certify(extremal, tolerance=self.accuracy)
         return jax.vmap(one)(self) if self.t.ndim == 2 else one(self)
 

@@ -1,4 +1,4 @@
-"""How good an extremal is: its Certificate, computed independently of what found it."""
+"""How good an extremal is: its Certificate, computed independently of its solver."""
 
 import equinox as eqx
 
@@ -15,8 +15,8 @@ def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -
     **Arguments:** `tolerance`: of the relative errors; `costly`: also fly the interpolated control
     with an adaptive integrator (Diffrax, 1e-11) and compare with the extremal's own states; and
     look for conjugate points, past which an extremal minimises nothing, by a backward sweep of its
-    second variation. Errors are relative to the size of what is compared, so the tolerance holds
-    in any units.
+    second variation. Errors are relative to the sizes of the quantities compared, so the
+    tolerance holds in any units.
 
     **Source:** 2002 paper, eqs (2)-(9); review, section 4.
     """

@@ -27,7 +27,8 @@ def _costates(problem: Problem) -> tuple[str, ...]:
 
 
 def canonical_equations(rows: Checks, a: Along, tight: float) -> None:
-    """Canonical equations, eqs (2) and (6), in integral form on Gauss points between the nodes."""
+    """Canonical equations, 2002 paper, eqs (2), (6), in integral form on Gauss points between the
+    nodes."""
     problem, size, after = a.extremal.problem, a.size, a.breaks[1:]
     f = a.at_gauss(lambda p, t, x, u, c, k: p.dynamics(t, x, u))
     h_x = a.at_gauss(jax.grad(constrained_hamiltonian, argnums=2))
@@ -39,7 +40,7 @@ def canonical_equations(rows: Checks, a: Along, tight: float) -> None:
 
 
 def boundary(rows: Checks, a: Along, tight: float) -> None:
-    """Boundary data and transversality, eqs (3), (8), (9)."""
+    """Boundary data and transversality: 2002 paper, eqs (3), (8), (9)."""
     extremal, size, (x0, xf, t0, tf) = a.extremal, a.size, a.ends()
     problem, nu, costate = extremal.problem, extremal.multipliers.endpoint, extremal.costate
     e = problem.endpoint_constraints(x0, xf, t0, tf)
@@ -85,8 +86,8 @@ def energy(rows: Checks, a: Along, tight: float) -> None:
     gap = (h_node[step::step] - h_node[0] - drift) / size.hamiltonian
     rows.add("Hamiltonian rate", ("H",), gap[:, None], a.breaks[1:], tight)
     if is_free(problem.final_time):
-        # Where controls jump between nodes the pointwise value misleads; its mean, by the nodes'
-        # own quadrature, does not (reference: 1/2 sum w lambda^T f).
+        # Where controls jump between nodes the pointwise value misleads; its mean by the nodes' own
+        # quadrature, 1/2 sum_i w_i H_i on each segment, does not.
         own = legendre_matrix(extremal.reference_nodes)[0]
         parts = jax.vmap(jax.vmap(value))(*a.parts[:4])
         mean = jnp.sum(2 * half * (parts @ own)) / (tf - t0)
@@ -97,7 +98,8 @@ def energy(rows: Checks, a: Along, tight: float) -> None:
 
 
 def jumps(rows: Checks, a: Along, tight: float) -> None:
-    """At a break the costate may jump, by a covector of a bound that is met there."""
+    """At a break the costate may jump by the covector of a state bound that is met there, and by
+    nothing else."""
     extremal, step = a.extremal, a.extremal.reference_nodes.shape[0] - 1
     if extremal.costate_before is None:
         return
@@ -129,7 +131,7 @@ def stationarity(rows: Checks, a: Along, tight: float) -> None:
         rows.add("stationarity of node values", names, hats, a.breaks, tight)
     h_uu = a.at_nodes(lambda p, t, x, u, c, k: jax.hessian(hamiltonian, argnums=3)(p, t, x, u, c))
     least = h_uu[:, 0, 0] if problem.m == 1 else jnp.linalg.eigvalsh(h_uu)[:, 0]
-    # The row is minus the least eigenvalue, so that <= 0 is what is wanted.
+    # Minus the least eigenvalue, so that the row passes if it is <= 0.
     worst = jnp.argmin(least)
     rows.add_signed("Legendre-Clebsch", ("-min eig H_uu",), -least[worst], t[worst], 0.0)
 

@@ -1,4 +1,4 @@
-"""Checks that fly: the control through the dynamics, and the second variation backwards."""
+"""The costly checks: the control flown through the dynamics, and conjugate points."""
 
 import diffrax
 import jax.numpy as jnp
@@ -12,14 +12,18 @@ from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, solve_sweeps
 from jaxguide.neighboring.sufficiency import conjugate_ahead
 from jaxguide.trajectory import Extremal
 
+# Tolerance and most steps of the adaptive integrator, and the relative error up to which the flown
+# states pass, whatever the method's accuracy: three digits above the first. Chosen, not tuned.
+_FLOWN_TO, _STEPS, _PASSES = 1e-11, 16384, 1e-8
+
 
 def propagation(rows: Checks, a: Along) -> None:
-    """Its states against those of the interpolated control, and conjugate points."""
+    """The extremal's states against those flown with its interpolated control; conjugate points."""
     extremal = a.extremal
     problem, t = extremal.problem, extremal.t
     gap = (_propagate(extremal, a.size.x) - extremal.x) / a.size.x[None]
-    rows.add("propagated state", problem.state_names, gap, t, 1e-8)
-    # The last break with one ahead is just before it: 1 there, 0 where there is none.
+    rows.add("propagated state", problem.state_names, gap, t, _PASSES)
+    # The row is 1, at the last break that has a conjugate point ahead, or 0 without any.
     ahead = _conjugate(extremal)
     last = jnp.where(jnp.any(ahead), ahead.shape[0] - 1 - jnp.argmax(ahead[::-1]), 0)
     count = jnp.any(ahead).astype(t.dtype)
@@ -39,9 +43,9 @@ def _propagate(extremal: Extremal, size: Float[Array, " n"]) -> Float[Array, "no
         extremal.t[-1],
         None,
         extremal.x[0] / unit,
-        stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
+        stepsize_controller=diffrax.PIDController(rtol=_FLOWN_TO, atol=_FLOWN_TO),
         saveat=diffrax.SaveAt(ts=extremal.t),
-        max_steps=16384,
+        max_steps=_STEPS,
         throw=False,
     )
     assert solution.ys is not None

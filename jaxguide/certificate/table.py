@@ -29,7 +29,8 @@ class Certificate(eqx.Module):
         return self.value <= self.tolerance  # NaN fails
 
     def worst(self) -> "Certificate":
-        """Of a batch: each row in the lane where it is furthest beyond its bound."""
+        """The rows of a batch, each from the lane where it is furthest beyond its bound."""
+        # 1e-300: rows with the bound 0 are not divided by it.
         beyond = jnp.where(
             jnp.isnan(self.value), jnp.inf, self.value / jnp.maximum(self.tolerance, 1e-300)
         )

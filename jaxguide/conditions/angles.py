@@ -1,4 +1,4 @@
-"""Controls that are angles, recognised by the Problem's periodicity: jumps of 2 pi removed."""
+"""Jumps of 2 pi removed from controls that are angles, recognised by the Problem's periodicity."""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from jaxguide.problem import Problem
 
-# Relative to the largest rate along the nodes: what a quarter turn must change at least, and what a
-# whole turn may at most (rounding of sine and cosine leaves 1e-15).
+# Relative to the largest rate along the nodes: the least change by a quarter turn, and the largest
+# by a whole turn, of which rounding of sine and cosine leaves 1e-15. Chosen, not tuned.
 _FELT, _SAME = 1e-6, 1e-9
 
 

@@ -15,8 +15,8 @@ from jaxguide.problem import Problem
 
 
 class BoundErrors(NamedTuple):
-    """By node, relative to sizes: oversteps of path constraints, states and controls, and
-    complementarity of all three, side by side in that order, relative to the Hamiltonian."""
+    """Errors at each node: oversteps of path constraints, states and controls, relative to their
+    sizes; complementarity of all three, side by side in that order, relative to the Hamiltonian."""
 
     path: Float[Array, "node p"]
     state: Float[Array, "node n"]

@@ -15,11 +15,11 @@ from jaxguide.problem import Problem, start_control
 # solution the correct digits double with each step, so that most of the 40 are left for the damped
 # steps before; a vmapped loop runs to its slowest lane, so that there must be a limit.
 _ROUNDING, _MAX_STEPS = 4, 40
-# Step lengths tried, all at once: a choice. H_u = 0 has few unknowns, so that
-# six values of H cost less than a search one after the other.
+# Step lengths tried, all at once: H has few unknowns, so that six values of it cost less than a
+# search of one after the other. Chosen, not tuned.
 _STEPS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.003)
-# A full step below this part of the control's size is taken whatever H says: near the solution the
-# change of H, of second order in the step, drowns in rounding long before the step does.
+# A full step below this part of the control's size is taken whatever H says: near the solution H
+# changes by the square of the step, 1e-8 and less, and rounding soon hides that. Chosen, not tuned.
 _SURE = 1e-4
 
 
@@ -62,7 +62,7 @@ def newton_control(
     def direction(u: Array) -> tuple[Array, Array]:
         g, h_uu = gradient(u), jax.jacfwd(gradient)(u)
         # Where H_uu is not positive definite, it is shifted by Gershgorin's bound on its lowest
-        # eigenvalue; a tenth of its size more keeps the step finite (a choice).
+        # eigenvalue; a tenth of its size more keeps the step finite (chosen, not tuned).
         radius = jnp.sum(jnp.abs(h_uu), axis=1) - jnp.abs(jnp.diag(h_uu))
         lowest = jnp.min(jnp.diag(h_uu) - radius)
         size = jnp.max(jnp.abs(h_uu)) + jnp.finfo(u.dtype).tiny
@@ -76,6 +76,7 @@ def newton_control(
         values = jax.vmap(h)(trials)
         best = trials[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
         full = trials[0]
+        # A full step that halves H_u and does not raise H is taken (the half is chosen, not tuned).
         settled = jnp.max(jnp.abs(gradient(full))) <= 0.5 * jnp.max(jnp.abs(g))
         small = jnp.max(jnp.abs(step)) <= _SURE * (1 + jnp.max(jnp.abs(u)))
         new = jnp.where((settled & (values[0] <= h(u))) | small, full, best)
@@ -92,9 +93,9 @@ def newton_control(
     return jax.lax.custom_root(gradient, guess, search, tangent_solve)
 
 
-# Parts of the control's size. `_FREE`: what the barrier's forces, of 1e-9 and less, would move the
-# control by stays below this where no constraint is active. `_NEAR`: how far a Newton step may go,
-# beyond an interpolation's error and short of another branch of H_u = 0: a choice.
+# Shares of the control's size. `_FREE`: the forces of the last barrier, 1e-9 and less, would move
+# the control by less than this where no constraint is active. `_NEAR`: the longest Newton step,
+# beyond an interpolation's error and short of another branch of H_u = 0. Chosen, not tuned.
 _FREE, _NEAR = 1e-7, 1e-3
 
 

@@ -12,7 +12,9 @@ from jaxguide.problem import Problem
 # A state is at rest if it stays below `_REST` of the distance by which its rate, with all terms of
 # one sign, could move it over the horizon; its size is then `_MOVED` of that. By experiment.
 _REST, _MOVED = 1e-6, 1e-3
-_TERMS = 1e-3  # part of the largest terms of H below which H, their sum, does not count as small
+# Share of the largest terms of H that is added to its size: H may vanish because they cancel, and
+# errors must be relative to something. Chosen, no experiment is recorded.
+_TERMS = 1e-3
 
 
 class Sizes(NamedTuple):

@@ -9,9 +9,12 @@ from jaxtyping import Array, Float
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import Problem, with_parameters
 
-REST = 1e-8  # a value below it is at rest at zero (a choice: a root of rounding, in any usual unit)
-# Orders of magnitude from 1 at which an unknown's size, estimated from the dynamics, is used. A
-# choice: an estimate is off by a factor of ten or more, and a unit need not be closer than that.
+# A value below it is at rest at zero: the square root of rounding, in the user's unit. Chosen, not
+# tuned.
+REST = 1e-8
+# Orders of magnitude from 1 at which an unknown's size, estimated from the dynamics, is used. An
+# estimate is off by a factor of ten or more, and a unit need not be closer than that. Chosen, not
+# tuned.
 _FAR = 3
 
 
@@ -37,9 +40,9 @@ def natural_units(
     """A unit for each state and control, of the order of its values, in user units.
 
     It is a bound or a value where one is known. Otherwise it is 1, unless the dynamics show that
-    the size is another by orders of magnitude. They give the size of an unknown from those of its
-    neighbours: what moves a state of known size by as much within the horizon, or how far a state
-    is moved by what is known.
+    the size is another by orders of magnitude. They relate sizes: an unknown is as large as it must
+    be to move a state of known size by as much within the horizon, or as far as quantities of known
+    size move it.
 
     **Arguments:** a guess in user units: `times`, of which the first two are t0 and tf; `x0`, the
     state at t0; `x`, the states after the first point of each segment, the last at its end; `u`,

@@ -19,9 +19,9 @@ class Actuator(eqx.Module):
     """Abstract: turns the held command into the one that the vehicle flies. Without memory, a
     function `actuator(command, t_k) -> Command` does as well.
 
-    `memory` is a pytree of what is remembered from one sample to the next (the control reached
-    before, say), None if nothing; it keeps its structure, shapes and dtypes. The methods must work
-    under `jit`, `vmap` and `grad`, and never raise for what a number is.
+    `memory` is a pytree carried from one sample to the next (the control reached before, say), None
+    if nothing is remembered; it keeps its structure, shapes and dtypes. The methods must work
+    under `jit`, `vmap` and `grad`, and never raise for the value of a number.
     """
 
     @abc.abstractmethod
@@ -37,7 +37,7 @@ class Actuator(eqx.Module):
         """The command as flown from `t_k` to the next sample.
 
         **Arguments:** `command`: as held, which may be asked at any time of the sample; `t_k` ():
-        time of the sample; `memory`: what the last call returned.
+        time of the sample; `memory`: that of the last call.
 
         **Returns:** a Command that carries on `command.result` and, unless it limits the control
         itself, `command.saturated`; and the new memory.
@@ -71,7 +71,7 @@ class ControlLimits(StagedActuator):
 
 
 class LimitedCommand(StagedCommand):
-    """`command` with its whole control limited: the deviation is what is left of it."""
+    """`command` with its whole control limited; the deviation is that control less the nominal."""
 
     command: Command
     limits: tuple[Float[Array, " m"], Float[Array, " m"]]

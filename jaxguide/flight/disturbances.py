@@ -18,7 +18,7 @@ class Disturbance(eqx.Module):
     once at the sample's beginning: the memory returned then is the next sample's. `memory` is a
     pytree that keeps its structure, shapes and dtypes (the strength of a gust, say), None if
     nothing is remembered. The methods must work under `jit`, `vmap` and `grad`, and never raise for
-    what a number is.
+    the value of a number.
     """
 
     # Whether the keys are used: a mission with such a disturbance cannot be flown without one.

@@ -25,7 +25,7 @@ class Estimator(eqx.Module):
     `update` takes in the measurement of each sample, the first one included; `predict` takes the
     memory from one sample to the next. `memory` is a pytree (an estimate and its covariance, say)
     that keeps its structure, shapes and dtypes. The methods must work under `jit`, `vmap` and
-    `grad`, and never raise for what a number is.
+    `grad`, and never raise for the value of a number.
     """
 
     @abc.abstractmethod
@@ -40,7 +40,7 @@ class Estimator(eqx.Module):
     def predict(self, memory: Any, flown: Command, t: Any, t_next: Any) -> Any:
         """The memory at the next sample, before its measurement.
 
-        **Arguments:** `memory`: what `update` returned at `t`; `flown`: `flown(s)` is the control
+        **Arguments:** `memory`: as `update` returned it at `t`; `flown(s)` is the control
         (m,) that was flown at any time s from `t` to `t_next`, after hold and actuator; `t`,
         `t_next` (): this sample's time and the next one's, or the end; they may be equal.
         """

@@ -14,10 +14,10 @@ from jaxguide.types import is_traced
 # Samples beyond those that fill the horizon, in which a law that decides the end closes in on it by
 # shorter and shorter ones (by experiment on the thesis's flights, which need two to four).
 _LAST_STEPS = 8
-# A sample interval above the horizon by less than this fraction is the horizon but for rounding,
-# and a last sample shorter than this fraction of an interval is none.
-_ROUNDING = 1e-12
-_NO_SAMPLE = 1e-9
+# A sample interval longer than the horizon by less than the fraction `_ROUNDING` is the horizon,
+# and a last sample shorter than `_NO_SAMPLE` of an interval is none: both far above the rounding of
+# times. Chosen, not tuned.
+_ROUNDING, _NO_SAMPLE = 1e-12, 1e-9
 
 
 def flight_horizon(plant: Problem, law: Any, initial_time: Any, final_time: Any) -> tuple[Any, Any]:
@@ -50,7 +50,7 @@ def sample_count(
 
     **Raises:** `ValueError` for an interval or a number of samples that does not fit.
     """
-    # What was given decides: under a trace, even a number becomes a tracer once it is an array.
+    # Asked of the arguments as given: under a trace, even a number becomes a tracer as an array.
     traced = is_traced((interval, ends))
     if jnp.ndim(interval):
         max_samples = _one_length_each(law, interval, None if traced else ends, dtype, max_samples)

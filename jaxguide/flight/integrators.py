@@ -21,7 +21,7 @@ class Integrator(eqx.Module):
     """Abstract: flies the vehicle across one sample.
 
     A pytree; whatever fixes its amount of work (steps, orders) is a static field. It must work
-    under `jit`, `vmap` and `grad`, and never raises for what a number is.
+    under `jit`, `vmap` and `grad`, and never raises for the value of a number.
     """
 
     @abc.abstractmethod
@@ -65,7 +65,7 @@ class StagedIntegrator(Integrator):
 
 
 class RungeKutta4(StagedIntegrator):
-    """The classical fourth-order method, `steps` equal steps a sample. Made for batches.
+    """The classical fourth-order method, `steps` equal steps a sample; fast in batches.
 
     **Error:** of fourth order in the sample interval over `steps`.
 

@@ -22,7 +22,7 @@ _DISTURBANCE = 2**32 - 2
 
 
 class Memories(NamedTuple):
-    """What each part of the loop remembers; None of a part that is absent or has no memory."""
+    """The memory of each part of the loop; None of a part that is absent or has none."""
 
     law: Any
     hold: Any
@@ -85,7 +85,7 @@ def _is_random(part: Sensor | Disturbance | None) -> bool:
 
 
 def _keys(mission: Mission, key: Any, k: Any) -> tuple[Any, Any]:
-    """Of the sensor and of the disturbance at sample k; None where it is not random."""
+    """Keys of the sensor and of the disturbance at sample k; None for one that is not random."""
     sensor = disturbance = None
     if _is_random(mission.sensor):
         sensor = jax.random.fold_in(key, k)

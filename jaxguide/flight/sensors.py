@@ -13,9 +13,9 @@ class Sensor(eqx.Module):
     """Abstract: the measurement at each sample. Without memory, a function `sensor(key, t, x) -> y`
     does as well.
 
-    `memory` is a pytree of what is remembered from one sample to the next (a bias that wanders,
-    say), None if nothing; it keeps its structure, shapes and dtypes. The methods must work under
-    `jit`, `vmap` and `grad`, and never raise for what a number is.
+    `memory` is a pytree carried from one sample to the next (a bias that wanders, say), None if
+    nothing is remembered; it keeps its structure, shapes and dtypes. The methods must work under
+    `jit`, `vmap` and `grad`, and never raise for the value of a number.
     """
 
     # Whether the keys are used: a mission with such a sensor cannot be flown without one.
@@ -36,7 +36,7 @@ class Sensor(eqx.Module):
         """The measurement at a sample.
 
         **Arguments:** `key`: a PRNG key of this sample's own, None where `random` is False; `t` ():
-        time of the sample; `x` (n,): the true state there; `memory`: what the last call returned.
+        time of the sample; `x` (n,): the true state there; `memory`: that of the last call.
 
         **Returns:** the measurement, of any fixed length (that of the state if no estimator comes
         between the sensor and the law), in the dtype of `x`; and the new memory.

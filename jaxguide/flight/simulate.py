@@ -23,7 +23,7 @@ _OVER = 2.5e-7
 
 
 class Flight(eqx.Module):
-    """What was flown. With `save="ends"` the histories hold the first and last sample only.
+    """One flight. With `save="ends"` the histories hold the first and last sample only.
 
     `t` (K+1,), `x` (K+1, n) at sample times and the end (repeated where the law ended early); `u`
     (K, m) and `commands` (K, m), the control and its deviation as commanded at each sample;
@@ -41,8 +41,8 @@ class Flight(eqx.Module):
 
 
 class Prepared(NamedTuple):
-    """What depends on time alone, shared by a batch of flights: the sample times of a mission and,
-    of one that can be flown fast, the stage times and the law looked up at them (else None)."""
+    """The part of a mission that depends on time alone, shared by a batch of flights: sample times
+    and, if it can be flown fast, the stage times and the law looked up at them (else None)."""
 
     times: Float[Array, " instant"]
     grid: SampleGrid | None
@@ -50,7 +50,7 @@ class Prepared(NamedTuple):
 
 
 def prepare(mission: Mission) -> Prepared:
-    """The part of a flight that depends on time alone: of use before a batch."""
+    """The part of `mission` that depends on time alone, computed once for a batch."""
     times = sample_times(mission)
     holds = [hold for hold in (mission.hold, mission.last) if hold is not None]
     law, integrator = mission.law, mission.integrator
@@ -139,8 +139,8 @@ def _through_samples(
 
 
 class Clock(eqx.Module):
-    """Of a flight whose end its law decides: the time, whether the sample under way is meant to be
-    the last, and whether the end was reached."""
+    """The clock of a flight whose end its law decides: the time, whether the sample under way is
+    meant to be the last, and whether the end was reached."""
 
     t: Float[Array, ""]
     ending: Bool[Array, ""]

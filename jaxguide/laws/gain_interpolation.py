@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.neighboring.suboptimal import SuboptimalSchedule
+from jaxguide.spectral import interval
 
 
 class StationGains(NamedTuple):
@@ -68,7 +69,7 @@ class TimeToGoGains(Interpolation):
         scale = jax.vmap(left)(stations)[:, None, :]
         blend = _blend(stations, jnp.minimum(tau, last))
         # A time to go below a thousandth of the last station's counts as that much, so that no gain
-        # is infinite (the fraction is a choice; a flight is then as good as over).
+        # is infinite. Chosen, not tuned: a flight is then as good as over.
         least = (1 - last) * 1e-3
         now = left(jnp.maximum(1 - tau, least) * -1 + 1)[None, :]
         time = (1 - stations)[:, None] * schedule.K_time
@@ -86,7 +87,6 @@ def _blend(stations: Float[Array, " g"], tau: Any) -> Any:
     two after them. Returns a function of the values at the stations."""
     if stations.shape[0] == 1:
         return lambda values: values[0]
-    after = jnp.searchsorted(stations, tau, side="right", method="compare_all")
-    i = jnp.clip(after - 1, 0, stations.shape[0] - 2)
+    i = interval(stations, tau)
     share = (tau - stations[i]) / (stations[i + 1] - stations[i])
     return lambda values: values[i] + share * (values[i + 1] - values[i])

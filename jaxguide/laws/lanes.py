@@ -38,8 +38,8 @@ class SampleGrid(eqx.Module):
 class StagedCommand(Command):
     """Abstract: a command known at the sample and at the stages of the integrator.
 
-    `nominal`, `deviation` and the call need be right at the sample alone. What is flown is the sum
-    of `nominal_on` and `deviation_on`.
+    `nominal`, `deviation` and the call need be right at the sample alone. The control flown is the
+    sum of `nominal_on` and `deviation_on`.
     """
 
     @abc.abstractmethod

@@ -1,5 +1,4 @@
-"""What a guidance law, its command and a hold are: the contracts, and the law that looks at
-nothing."""
+"""The contracts of a guidance law, its command and a hold; and the law without feedback."""
 
 import abc
 from typing import Any, ClassVar
@@ -22,7 +21,7 @@ class Command(eqx.Module):
     - `saturated` (): whether a limit holds the control back at the sample (a flight counts these).
 
     All times are those of the mission, in its unit; controls are in the units of the plant. A
-    method never raises for what a number is: a state of NaN gives a control of NaN.
+    method never raises for the value of a number: a state of NaN gives a control of NaN.
     """
 
     result: eqx.AbstractVar[RESULTS]
@@ -55,8 +54,8 @@ class Command(eqx.Module):
 class Law(eqx.Module):
     """Abstract: a guidance law, which turns a measurement into the command for the next sample.
 
-    `memory` is a pytree of what the law must remember from one sample to the next, None if nothing.
-    It keeps its structure, shapes and dtypes, since a flight is one `lax.scan`. Both methods must
+    `memory` is a pytree that the law carries from one sample to the next, None if it needs none. It
+    keeps its structure, shapes and dtypes, since a flight is one `lax.scan`. Both methods must
     work under `jit`, `vmap` and `grad`: no Python branch on the value of an array, and no exception
     for one; the command's `result` says what went wrong.
     """
@@ -112,7 +111,7 @@ class Hold(eqx.Module):
 
 
 class OpenLoop(Law):
-    """Flies the nominal control and looks at nothing.
+    """Flies the nominal control, without feedback.
 
     **Arguments:** `extremal`: a `jg.Extremal`, or anything that gives `.u` (m,) at a time.
     """

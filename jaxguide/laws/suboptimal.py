@@ -180,7 +180,7 @@ class TimeToGo(Law):
         return command, plan
 
     def latest_end(self, initial_time: Any) -> Float[Array, ""]:
-        # Half as long again as the nominal: a flight that needs more is beyond neighbouring laws.
+        # Half as long again as the nominal (chosen): a longer flight is no neighbour of it.
         return initial_time + 1.5 * self.schedule.duration
 
     def _reference(self, x: Array, guess: Array) -> tuple[Array, Bool[Array, ""]]:
@@ -194,7 +194,7 @@ class TimeToGo(Law):
         frozen, at, middle = jax.lax.stop_gradient((self, x, guess))
         value = lambda tau: change(tau, frozen, at)
         both = lambda tau: jax.jvp(value, (tau,), (jnp.ones_like(tau),))
-        # The nominal is known a little past its end, by its last polynomial.
+        # Its last polynomial gives the nominal a little past its end: a quarter interval (chosen).
         positions = frozen.schedule.positions
         past = 1 + (1 - positions[-2]).astype(x.dtype) / 4
         low = jnp.asarray(middle - self.window, x.dtype)

@@ -12,7 +12,8 @@ from jaxtyping import Array
 
 from jaxguide.types import is_traced
 
-# Of the largest entry: eigenvalues of a singular covariance come out negative by rounding, n eps.
+# Share of the largest entry by which an eigenvalue may be negative: of a singular covariance,
+# rounding makes it n eps.
 _SINGULAR = 1e-12
 
 
@@ -167,8 +168,8 @@ class LogNormal(Distribution):
 
 
 class Relative(Distribution):
-    """The draws of `distribution` times the leaf: `Relative(Normal(0.01))` has a standard deviation
-    of one per cent of the leaf."""
+    """The draws of `distribution` times the leaf: those of `Relative(Normal(0.01))` have a standard
+    deviation of one per cent of it."""
 
     distribution: Distribution
 

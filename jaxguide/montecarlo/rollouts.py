@@ -33,9 +33,7 @@ def draw(
     for paths, distribution in sorted_by_path(dispersions):
         leaves = [leaf_at(mission, path) for path in paths]
         stream = jax.random.fold_in(key, _hash(" ".join(paths)))
-        whole = leaves[0]
-        if len(paths) > 1:
-            whole = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
+        whole = _joined(leaves)
         at = None if u is None else u[used : used + whole.size].reshape(whole.shape)
         at = None if at is None else at.astype(whole.dtype)
         used += whole.size
@@ -60,11 +58,13 @@ def spread(mission: Mission, dispersions: dict[Any, Distribution]) -> list[tuple
     out = []
     for paths, distribution in sorted_by_path(dispersions):
         leaves = [leaf_at(mission, path) for path in paths]
-        whole = leaves[0]
-        if len(paths) > 1:
-            whole = jnp.concatenate([leaf.reshape(-1) for leaf in leaves])
-        out.append((paths, distribution.spread(whole)))
+        out.append((paths, distribution.spread(_joined(leaves))))
     return out
+
+
+def _joined(leaves: list[Array]) -> Array:
+    """One leaf as it is; several as one vector."""
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate([v.reshape(-1) for v in leaves])
 
 
 def sorted_by_path(

@@ -8,18 +8,23 @@ from jaxtyping import Array, Float
 from jaxguide.bounds import positive
 from jaxguide.trajectory import Extremal
 
-# Times at which the canonical system is looked at, at least; by experiment on the library. A
-# segment of the extremal holds `_PER_SEGMENT` of them or more.
+# Least number of times at which the canonical system is evaluated, and of those in a segment of the
+# extremal; by experiment on the library.
 _PROBES, _PER_SEGMENT = 256, 8
-_HALVINGS = 12  # further probes of the last segment, at 1 - 2^-1 ... 1 - 2^-12 of it
+# Further probes of the last segment, at 1 - 2^-1 ... 1 - 2^-12 of it. Chosen, no experiment is
+# recorded.
+_HALVINGS = 12
 # Segments shrink towards the end in proportion to the time left, down to this part of the horizon:
-# hard constraints make the gain a ratio of small differences there.
+# hard constraints make the gain a ratio of small differences there. Chosen, no experiment is
+# recorded.
 _LAST = 2.0**-17
-_GRADING = 0.8  # segments per e-fold of the time left; chosen by experiment
-# Parts of the density of segments: an even one of `_EVEN` over the horizon and `_SHARE` of the mean
-# keep segments from growing without limit where nothing happens; by experiment on the library.
+# Segments per e-fold of the time left; by experiment, on which problems is not recorded.
+_GRADING = 0.8
+# Added to the density of segments, `_EVEN` over the horizon and `_SHARE` of its mean: segments do
+# not grow without limit where nothing happens. By experiment on the library.
 _EVEN, _SHARE = 2.0, 0.1
-_CONTRACTION = 0.5  # weight of |M|, beside the inverse lengths over which M changes; likewise
+# Weight of |M| in that density: a Picard sweep contracts by |M| times half the segment's length.
+_CONTRACTION = 0.5
 
 
 def probe_times(extremal: Extremal) -> Float[Array, " probe"]:
@@ -54,8 +59,8 @@ def balancing_scale(
 def place_breaks(
     t: Float[Array, " probe"], M: Float[Array, "probe two_n two_n"], segments: int
 ) -> Float[Array, " edge"]:
-    r"""Breaks that share out equally $|M'|/|M| + \sqrt{|M''|/|M|} + |M|/2$ and a floor, and that
-    crowd towards the end.
+    r"""Breaks between which $|M'|/|M| + \sqrt{|M''|/|M|} + |M|/2$ and a floor have equal integrals,
+    crowded towards the end.
 
     The first two terms are the inverse length over which M changes; |M| bounds the contraction of
     the Picard sweeps.
@@ -75,7 +80,7 @@ def place_breaks(
     mass = jnp.concatenate([jnp.zeros(1, t.dtype), jnp.cumsum((density + floor) * h)])
     left = (t[-1] - t) / span + _LAST
     e_folds = jnp.log(left[0] / left)
-    # The crowding takes half of the segments at most; the density shares out the others.
+    # The crowding takes at most half of the segments (chosen); the density places the others.
     grading = jnp.minimum(_GRADING, 0.5 * segments / e_folds[-1])
     mass = mass / mass[-1] * (segments - grading * e_folds[-1]) + grading * e_folds
     wanted = mass[-1] * jnp.linspace(0.0, 1.0, segments + 1, dtype=t.dtype)

@@ -46,7 +46,7 @@ def _square_rows(points: int, n: int) -> np.ndarray:
 
 
 class Horizons(NamedTuple):
-    """Of the horizon from each time to the end: deviations at its LGL points, per deviation of the
+    """Deviations at the LGL points of the horizon from each time to the end, per deviation of the
     state at its start."""
 
     nodes: Float[Array, " node"]  # of [-1, 1]

@@ -1,4 +1,4 @@
-"""Gains at one time from the adjoint rows there: how costate, control and final time change."""
+"""Gains at one time, from the adjoint rows there: of costate, control and final time."""
 
 import functools
 from typing import NamedTuple
@@ -20,7 +20,7 @@ class CostateGains(NamedTuple):
     S: Float[Array, "n known"]  # of the costate
     K: Float[Array, "m known"]  # of the control
     time: Float[Array, " known"]  # of the final time, where it is free
-    rounding: Float[Array, ""]  # a bound of what rounding leaves of S, over its size
+    rounding: Float[Array, ""]  # bound on the rounding error of S, relative to its size
 
 
 @functools.partial(jax.jit, static_argnames="free_time")
@@ -48,7 +48,7 @@ def gains_at(sweep: Sweep, c: Canonical, t: Array, free_time: bool) -> CostateGa
 def _solved(
     G: Float[Array, "n n"], known: Float[Array, "n known"]
 ) -> tuple[Float[Array, "n known"], Float[Array, ""]]:
-    """S with G S = -known, refined once, and Skeel's bound of what rounding leaves of it."""
+    """S with G S = -known, refined once, and Skeel's bound on its relative rounding error."""
     inverse = gauss_solve(G, jnp.eye(G.shape[0], dtype=G.dtype))
     S = -inverse @ known
     S = S - inverse @ (G @ S + known)

@@ -15,12 +15,13 @@ from jaxguide.neighboring.sweep import Sweep
 from jaxguide.spectral import interpolate
 from jaxguide.trajectory import Extremal
 
-# Part of the span of times: a time meant to be a sample may differ from it by rounding.
+# Share of the span of times by which a time may differ from a sample and count as it: some 1e4
+# roundings, chosen.
 _SAME_TIME = 1e-12
 
 
 class GainMap(eqx.Module):
-    """What a `GainSchedule` knows beyond its tables: gains about `extremal` between `times`."""
+    """Abstract: the gains of a `GainSchedule` between its `times`, and its histories."""
 
     @abc.abstractmethod
     def gain(
@@ -63,7 +64,7 @@ class SweptGains(GainMap):
 
 class HorizonGains(GainMap):
     """From the solution on the remaining horizon of each of the schedule's times: 2002 paper,
-    eqs (46)-(49). The horizon used is that of the last time passed."""
+    eqs (46)-(49). Between two times, that of the earlier one is used."""
 
     horizons: Horizons
 

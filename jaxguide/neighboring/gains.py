@@ -159,7 +159,7 @@ def _segmented(
     over_times = jax.vmap(lambda s, c, t: gains_at(s, c, t, free_time), in_axes=(None, 0, 0))
     gains = jax.vmap(over_times, in_axes=(0, None, None))(both, pair.at_times, times)
     K, fine = gains.K[0, :, :, :n], gains.K[1, :, :, :n]
-    # Thrice the difference: the finer solution is not exact either.
+    # Thrice the difference, as the finer solution is not exact either: a margin chosen, not tuned.
     error = 3 * _relative(K - fine, fine) + gains.rounding[1]
     error = jnp.where(jnp.isfinite(error), error, jnp.inf)
     resolved, result = _judged(pair, times, error <= tolerance)
@@ -202,8 +202,9 @@ def _judged(
     return fine_enough & convex_ahead & ~conjugate, result
 
 
-# Part of a quantity's size along the extremal: how near a bound counts as on it. What a barrier of
-# 1e-9 leaves between an active bound and the solution is far below.
+# Distance, as a share of a quantity's size along the extremal, at which it counts as on its bound:
+# far above the distance that an interior-point method's last barrier, 1e-10, leaves. Chosen, not
+# tuned.
 _ON_BOUND = 1e-6
 
 

@@ -1,4 +1,4 @@
-"""Neighbouring extremals carried through a sweep: the history of a deviation."""
+"""A neighbouring extremal from one time to another through a sweep: the history of a deviation."""
 
 import jax
 import jax.numpy as jnp

@@ -15,11 +15,11 @@ from jaxguide.problem import Problem, is_free
 from jaxguide.spectral import interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal, Point
 
-SEGMENTS, NODES, SWEEPS = 72, 8, 8  # the defaults: some 1e-9 where a control turns sharply
-_FINER = 2  # Gauss points more in the finer sweep
-# Picard sweeps of the finer one. It starts from the coarser solution, so that few show the
-# difference; by experiment.
-_FINER_SWEEPS = 5
+# The defaults: gains of Earth-Mars, whose control turns sharply, to 4e-10 (`bench/gains.py`).
+SEGMENTS, NODES, SWEEPS = 72, 8, 8
+# Gauss points more in the finer sweep (chosen, not tuned), and its Picard sweeps: starting from the
+# coarser solution, few show the difference (by experiment; on which problems is not recorded).
+_FINER, _FINER_SWEEPS = 2, 5
 
 
 @functools.partial(jax.jit, static_argnames="parameters")
@@ -98,7 +98,7 @@ def _transitions(
     fine_times: Float[Array, "f segment"],
     sweeps: int,
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Of both systems: the slopes (Phi - I)/(t_e - t) at the finer Gauss points, and the
+    """For both systems, the slopes (Phi - I)/(t_e - t) at the finer Gauss points, and the
     transitions across the segments."""
     widths = jnp.diff(breaks)
     eye = identity((coarse.shape[1], coarse.shape[2]), coarse.dtype)[None, :, :, None]

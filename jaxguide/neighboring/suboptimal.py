@@ -14,12 +14,13 @@ from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, polished
 from jaxguide.problem import is_free
+from jaxguide.spectral import interval
 from jaxguide.trajectory import Extremal
 from jaxguide.types import is_traced, require_x64
 
-# Least pivot of the Gram matrix of unit constraint rows below which they count as dependent. Pivots
-# are squares of sines: rows that differ by an angle of 3e-5 count as independent, and rounding
-# leaves 1e-15: a choice between the two.
+# Pivot of the Gram matrix of unit constraint rows below which they count as dependent. Pivots are
+# squares of sines, of which rounding leaves 1e-15: rows that differ by an angle above 3e-5 count as
+# independent. Chosen, not tuned.
 _RANK = 1e-9
 
 
@@ -56,7 +57,7 @@ class SuboptimalSchedule(eqx.Module):
 
     def state(self, tau: Any) -> Float[Array, " n"]:
         """The nominal state at the scalar `tau`; beyond the ends, its polynomial goes on."""
-        i = par.interval(self.positions, tau)
+        i = interval(self.positions, tau)
         a, b = self.positions[i], self.positions[i + 1]
         local, terms = (2 * tau - a - b) / (b - a), self.polynomials[i]
         value = terms[0]
@@ -70,7 +71,7 @@ class SuboptimalSchedule(eqx.Module):
 
 
 class Sensitivities(NamedTuple):
-    """Derivatives of what follows each station, by the state x there and by the parameters a.
+    """Derivatives of the trajectory after each station, by the state x there and the parameters a.
 
     G = J + nu^T psi is the augmented cost: thesis, eq. (3.1).
     """
@@ -221,7 +222,7 @@ def _schedule(
     K_time = K[:, -1] if free else jnp.zeros((stations.shape[0], n), K.dtype)
     K = K[:, : k * m].reshape(-1, k, m, n)
     controls = par.unpack(problem, a)[0]
-    first = jax.vmap(lambda tau: par.interval(positions, tau))(stations)
+    first = jax.vmap(lambda tau: interval(positions, tau))(stations)
     at = lambda i: jax.vmap(lambda K, i: K[i])(K, i)
     points = extremal.reference_nodes
     exponents = jnp.arange(points.shape[0] - 1, -1, -1).astype(points.dtype)
@@ -243,7 +244,7 @@ def _schedule(
 
 
 def _parameter_sizes(extremal: Extremal, k: int) -> Float[Array, " p"]:
-    """How large each parameter is along the nominal: k controls a node, and a free duration."""
+    """How large each parameter is along the nominal: the controls of k nodes, a free duration."""
     problem = extremal.problem
     sizes = jnp.tile(size_along(extremal.u, problem.control_bounds), k)
     return (
@@ -299,7 +300,7 @@ def _dependence(D: Float[Array, "q p"]) -> Float[Array, ""]:
 def _remaining(
     extremal: Extremal, positions: Array, a: Array, nu: Array, tau: Array, x: Array
 ) -> tuple[Sensitivities, Array]:
-    """Derivatives at the optimum of what follows `tau`."""
+    """Derivatives of the trajectory after `tau`, at its own optimum."""
     z, active = _optimum(extremal, positions, a, nu, tau, x)
     return _derivatives(extremal, positions, z.a, z.nu, tau, x, False), active
 
@@ -311,7 +312,7 @@ def _optimum(
     parameters belong to it: those of nodes not yet passed."""
     problem, m = extremal.problem, extremal.problem.m
     k = positions.shape[0]
-    first = par.interval(positions, tau)
+    first = interval(positions, tau)
     order = jnp.arange(k, dtype=first.dtype)
     active = jnp.repeat(order >= first, m)
     if is_free(problem.final_time):

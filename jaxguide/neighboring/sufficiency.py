@@ -1,4 +1,4 @@
-"""Conjugate points ahead, which an extremal that is a minimum from here on has none of."""
+"""Conjugate points: an extremal with one ahead is no minimum from here on."""
 
 import jax
 import jax.numpy as jnp

@@ -59,7 +59,7 @@ def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
     admissible control closest to 0.
 
     Near, and not at: a tenth of half the width (or 0.1) keeps clear of points where H_u = 0 by
-    symmetry, which may be maxima. A choice.
+    symmetry, which may be maxima. Chosen, not tuned.
     """
     lo, hi = bounds_of(problem.control_bounds, problem.m, dtype)
     finite = jnp.isfinite(lo) & jnp.isfinite(hi)

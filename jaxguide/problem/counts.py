@@ -8,14 +8,14 @@ from jaxguide.problem.statement import Problem
 
 
 def count(problem: Problem, name: str) -> int:
-    """How many components `name` has: "path_constraints" or "integrands"."""
+    """Number of components of `name`: "path_constraints" or "integrands"."""
     dtype = jnp.result_type(float)
     t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
     return jax.eval_shape(getattr(with_parameters(problem, None), name), t, x, u).shape[0]
 
 
 def endpoint_count(problem: Problem) -> int:
-    """How many endpoint constraints it has."""
+    """Number of endpoint constraints."""
     dtype = jnp.result_type(float)
     t, x = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((problem.n,), dtype)
     problem = with_parameters(problem, None)

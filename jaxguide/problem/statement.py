@@ -55,8 +55,8 @@ class Problem(eqx.Module):
               def initial_state(self):
                   return (0.0, self.speed)
 
-      A property is no field: it has no leaf and cannot be replaced. Replace what it follows from;
-      derivatives by that include what the property does with it.
+      A property is no field: it has no leaf and cannot be replaced. Replace the fields that it is
+      computed from; derivatives by them go through the property.
 
     **Raises:** `TypeError` for a plain array or list over a property of the base class: write a
     tuple, or a property.

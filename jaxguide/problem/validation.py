@@ -13,9 +13,9 @@ from jaxguide.problem.parameters import with_parameters
 from jaxguide.problem.statement import Problem, is_free, start_value, with_array_leaves
 from jaxguide.types import is_traced
 
-# How far an initial state may lie outside the state bounds, relative to 1 + |x0|: arithmetic may
-# have lost that much. In the user's unit, as bounds of (0, inf) tell no size; a start that is
-# further outside in smaller units is found infeasible by the method.
+# How far an initial state may lie outside the state bounds, relative to 1 + |x0|: the rounding of
+# whatever computed it. The 1 is in the user's unit, as bounds of (0, inf) tell no size; where that
+# lets too much pass, the method finds the start infeasible. Chosen, not tuned.
 _ROUNDING = 1e-9
 
 
@@ -41,9 +41,10 @@ def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: A
         ) from e
     shape = getattr(out, "shape", None)
     if wanted is not None and shape != wanted:
+        entry = "control" if name == "optimal_control" else "state"
         raise ValueError(
             f"{type(problem).__name__}.{name} returned shape {shape}, expected {wanted}. "
-            + ("Return a scalar." if wanted == () else "Stack one entry per state.")
+            + ("Return a scalar." if wanted == () else f"Stack one entry per {entry}.")
         )
     if wanted is None and (shape is None or len(shape) != 1):
         raise ValueError(

@@ -10,6 +10,7 @@ from jaxguide.spectral.grids import Grid as Grid
 from jaxguide.spectral.grids import grid as grid
 from jaxguide.spectral.interpolation import interpolate as interpolate
 from jaxguide.spectral.interpolation import interpolate_piecewise as interpolate_piecewise
+from jaxguide.spectral.interpolation import interval as interval
 from jaxguide.spectral.maps import AbstractMap as AbstractMap
 from jaxguide.spectral.maps import BilinearMap as BilinearMap
 from jaxguide.spectral.maps import LinearMap as LinearMap

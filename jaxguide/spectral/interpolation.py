@@ -1,5 +1,7 @@
 """Barycentric interpolation of arrays, on one grid or on many segments."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -87,3 +89,10 @@ def interpolate_piecewise(
     empty = length <= 0  # only if all segments are
     tau = jnp.where(empty, -1, 2 * (t - breaks[i]) / jnp.where(empty, 1, length) - 1)
     return interpolate(nodes, values[i], tau)
+
+
+def interval(breaks: Float[Array, " k"], t: Any) -> Array:
+    """Index of the interval between `breaks` that holds the scalar `t`; beyond the ends, of the
+    nearest one."""
+    after = jnp.searchsorted(breaks, t, side="right", method="compare_all")
+    return jnp.clip(after - 1, 0, breaks.shape[0] - 2)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.spectral import legendre_matrix, legendre_vandermonde, nodes_lg
+from jaxguide.spectral import interval, legendre_matrix, legendre_vandermonde, nodes_lg
 
 _POINTS = 32  # of the quadrature of a density: exact to rounding for weights of a few modes
 
@@ -99,8 +99,7 @@ def thinned_weights(
     ends = (inner == 0) | (inner == n - 1)
     present = jnp.where(ends, 1.0, present)
     absent = 1 - present
-    after = jnp.searchsorted(places, t, side="right", method="compare_all")
-    at = jnp.clip(after - 1, 0, n - 2)  # the node to the left, if all were kept
+    at = interval(places, t)  # the node to the left, if all were kept
     left = inner <= at.astype(inner.dtype)
     # Probability that i is the nearest node kept to the left: it is kept, none between is.
     gap_left = jnp.cumprod(jnp.where(left, absent, 1.0)[::-1])[::-1]

@@ -15,15 +15,16 @@ from jaxguide.nominal.direct.trees import total
 _tree = jax.tree_util.tree_map
 Entries: TypeAlias = Any  # one number for each unknown: a Primal, or all of them as one vector
 
-# kappa_d, damping of one-sided bounds: Waechter & Biegler (2006), section 3.7 (Ipopt's default).
+# kappa_d, damping of one-sided bounds: Waechter & Biegler (2006), section 3.7; the value is
+# Ipopt's.
 _KAPPA_D = 1e-5
 # Room added to every bound, relative to it or to 1, so that a state may end on one and the interior
-# is not empty: Waechter & Biegler (2006), section 3.5. They take 1e-8; a tenth of it is a choice.
+# is not empty: Waechter & Biegler (2006), eq. (35). Ipopt takes 1e-8; here the default tolerance.
 _RELAX = 1e-9
 
 
 class Box(NamedTuple):
-    """Bounds and what follows from them.
+    """Bounds, and which entries have them.
 
     - `below`, `above`: bool, whether an entry has a lower, an upper bound and may move.
     - `given`: bool, whether both bounds coincide, so that the entry may not move.

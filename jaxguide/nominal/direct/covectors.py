@@ -131,7 +131,7 @@ def _multipliers(
     ahead = lambda a: jnp.concatenate([a[0, :1], jnp.concatenate(a[:, 1:])])
     owned = ahead if rule.first else whole
     over_nodes = lambda a: owned(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
-    # A given control has no bounds' multipliers: its own is what the Lagrangian's gradient leaves.
+    # A given control has no bounds' multipliers: its own is minus the Lagrangian's gradient by it.
     nodes, ends = program.derivatives(w)
     left = lagrangian_gradient(program, nodes, ends, w, solution.y).u
     net_u = jnp.where(limits.lo.u >= limits.hi.u, -left, solution.zu.u - solution.zl.u)
@@ -179,7 +179,7 @@ def _result(
 
 
 def _undecided(limits: Limits, solution: interior_point.Solution) -> Bool[Array, ""]:
-    """Whether the distance of a bound and its multiplier, whose product is the barrier mu, are both
+    """Whether the distance to a bound and its multiplier, whose product is the barrier mu, are both
     within a factor of `_WEAK` of sqrt(mu): there the barrier's derivative is off by a hundredth or
     more."""
     box = Box(*map(flattened, boxed(limits)))
@@ -203,9 +203,9 @@ def costates(program: Transcription, limits: Limits, solution: interior_point.So
     """Costates lambda_i of problem B^{lambda N} from the defect multipliers y of the Lagrangian
     f + y^T (A X - B F). The Extremal interpolates between them, review, eq. (23).
 
-    At a segment's start the costate is what the derivative of the Lagrangian with respect to the
-    state there gives (the closure condition). LGL and CGL solutions carry besides a multiple of the
-    left null vector of D, which both closures fix, state by state.
+    At a segment's start the costate is the derivative of the Lagrangian with respect to the state
+    there (the closure condition). LGL and CGL solutions also carry a multiple of the left null
+    vector of D, which both closures fix, state by state.
 
     **Source:** Ross & Karpenko, review (2012), eqs (23)-(24), Proposition 1 and Remark 3.
     """

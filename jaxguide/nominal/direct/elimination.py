@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Int
 from jaxguide.nominal.direct.newton_system import COMPLIANCE, NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 
-# Barrier curvature that stands for a given control. A choice: the square root of it, by which the
-# control's column is divided, is 1e8, so that the control moves by rounding alone.
+# Barrier curvature that stands for a given control. Chosen, not tuned: its square root, by which
+# the control's column is divided, is 1e8, so that the control moves by rounding alone.
 _STIFF = 1e16
 
 
@@ -51,7 +51,7 @@ def over_segments(f: Any, items: Any) -> Any:
 
 
 def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
-    """The null space of the defects, and what is left of the quadratic on it.
+    """The null space of the defects, and the quadratic restricted to it.
 
     The LU is stable however unstable the dynamics are; following the states from their start would
     not be. Pivoting, over states and controls alike, makes those entries basic that the defects
@@ -82,7 +82,7 @@ def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
 def _null_space(
     program: Transcription, diagonal: Array, jacobian: Array, weight: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Of one segment: `basis`, `order`, `place` of Segments, and (x, u) from v."""
+    """`basis`, `order` and `place` of one segment, see Segments, and (x, u) from v."""
     rule, n, m, C = program.rule, program.counts.n, program.counts.m, program.counts.nodes
     dtype = weight.dtype
     B = jnp.asarray(rule.B, dtype)

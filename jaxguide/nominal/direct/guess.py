@@ -25,10 +25,12 @@ from jaxguide.problem import (
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import evened
 
-# Constant controls that are tried where states rest, from the middle of a control's range and as
-# shares of it: chosen for the brachistochrone, whose start is singular at rest.
+# Constant controls that are tried where states rest: distances from the middle of a control's
+# range, as shares of it. Chosen for the brachistochrone, whose start is singular at rest.
 _SHARES = (0.0, -0.25, 0.25)
-_SPREAD = math.log(2)  # of a random horizon: within a factor of two of the guess
+# A random horizon is within a factor of two of the guess, and random waves of the states are a
+# third of their natural unit: chosen, not tuned.
+_SPREAD, _WAVE = math.log(2), 3
 
 
 def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Array, "edge clock"]:
@@ -85,8 +87,8 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     """`w` with the states `rests`, which start at zero and need meet no end, integrated along it.
 
     Where a start is singular at rest (a brachistochrone's, without speed), the middle control may
-    leave them there. Of three constant controls, that one is taken which fits the other states'
-    rates best.
+    leave them there. The one of three constant controls that fits the other states' rates best is
+    taken.
     """
     problem, counts, dtype = with_parameters(program.problem, None), program.counts, program.dtype
     lo, hi = bounds_of(problem.control_bounds, counts.m, dtype)
@@ -129,7 +131,7 @@ def random_guess(
     k_x, k_u, k_t = jax.random.split(key, 3)
     lo, hi = bounds_of(program.problem.state_bounds, counts.n, dtype)
     of_x, of_u = _natural_units(program, w)
-    waves = jax.random.normal(k_x, (2, counts.n), dtype) * of_x[None] / 3
+    waves = jax.random.normal(k_x, (2, counts.n), dtype) * of_x[None] / _WAVE
     s = fractions_at(fractions, rule.support[1:])
     bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
     x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])

@@ -34,8 +34,8 @@ _tree = jax.tree_util.tree_map
 def sensitivity(program: Transcription, solution: Solution, tangent: Any) -> Solution:
     """Change of `solution` per change `tangent` of `program`'s (problem, edges); transposable.
 
-    Active bounds are held by their barrier: at its last value mu a bound's curvature is z^2/mu, so
-    that it moves by mu/z of what a free one would. Where z is itself of the order of sqrt(mu) (a
+    Entries on a bound are held there by the barrier: at its last value mu its curvature is z^2/mu,
+    and they move some mu/z^2 as far as free ones would. Where z is of the order of sqrt(mu) (a
     bound just touched, a singular arc) the derivative is that of the barrier problem, and the
     extremal's `degenerate` says so.
     """

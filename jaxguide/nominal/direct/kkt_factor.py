@@ -23,21 +23,22 @@ from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Counts
 
 # Curvature of the penalty on the final state's gap in the sweep, relative to the Hessian's largest
-# entry. A choice: it need only make the sweep convex, as the multiplier beside it closes the gap.
+# entry. Chosen, not tuned: it need only make the sweep convex; the multiplier beside it closes the
+# gap.
 PENALTY = 1e2
 # Softness lent to the multipliers of the last system, relative to its largest entries, so that a
-# redundant constraint does not make it singular. A choice, some 1e5 roundings: refinement takes it
-# out again.
+# redundant constraint does not make it singular. Chosen, not tuned: some 1e5 roundings, which
+# refinement takes out again.
 _SOFT = 1e-11
 _LEAST_SIZE = 1e-300  # of a row of the last system, lest a row of zeros be divided by zero
-# Least barrier curvature of an endpoint slack, so that its inverse, the flexibility, is finite: far
-# below any that the barrier gives (a choice).
+# Least barrier curvature of an endpoint slack, so that its inverse, the flexibility, is finite.
+# Chosen, not tuned: far below any that the barrier gives.
 _LEAST_CURVATURE = 1e-12
 
 
 class SweepLayout(NamedTuple):
-    """Where the parameters theta = (start, times, p, xf, lambda_f) of the sweep lie, and where the
-    globals that move freely, (x0, times, p), end. lambda_f is the multiplier of the final state.
+    """Slices of the sweep's parameters theta = (start, times, p, xf, lambda_f), lambda_f being the
+    multiplier of the final state; `moving`: how many of the first move freely, (x0, times, p).
     """
 
     start: slice
@@ -71,7 +72,7 @@ class SweepStage(NamedTuple):
 class Factor(NamedTuple):
     """The factorised matrix: everything that a right-hand side needs.
 
-    - `W`: see Segments, regularised. `delta`: what was added to the Hessian's diagonal.
+    - `W`: see Segments, regularised. `delta`: added to the Hessian's diagonal.
     - `rho`: curvature of the penalty on the final state's gap in the sweep.
     - `eigenvalues`, `vectors`, `equilibrium`, `K`: the system of the globals, scaled by
       `equilibrium`. `held`: which of them may not move.

@@ -24,9 +24,9 @@ from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.trees import largest, zeros_like
 from jaxguide.nominal.direct.unknowns import Equations, Primal
 
-# Iterative refinement: at most `_REFINEMENTS` after the first solution, until what is left of the
-# forces is `_ENOUGH` of them, some 1e4 roundings, and of the residuals `_ENOUGH_RESIDUAL`: a Newton
-# step that leaves a millionth of the constraints loses nothing. Choices.
+# Iterative refinement: at most `_REFINEMENTS` after the first solution, until the step leaves
+# `_ENOUGH` of the forces, some 1e4 roundings, and `_ENOUGH_RESIDUAL` of the residuals: a Newton
+# step that leaves a millionth of the constraints loses nothing. Chosen, not tuned.
 _REFINEMENTS, _ENOUGH, _ENOUGH_RESIDUAL = 2, 1e-12, 1e-6
 _LEAST_RESIDUAL = 1e-15  # rounding: residuals below it are zero
 
@@ -40,8 +40,8 @@ class _Particular(NamedTuple):
 
 
 class _Sweep(NamedTuple):
-    """Of the backward sweep: the linear part of the value at the start, the z of each segment at
-    theta = 0, negated, and the linear part of the value after each segment."""
+    """The backward sweep's results: the linear part of the value at the start, minus the z of each
+    segment at theta = 0, and the linear part of the value after each segment."""
 
     p: Float[Array, " theta"]
     k: Float[Array, "segment z"]

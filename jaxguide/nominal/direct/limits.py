@@ -11,8 +11,8 @@ from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
 from jaxguide.problem import initial_bounds, initial_values, initially_free, is_free, parameters
 
-# Least distance of successive free knots, as a share of the horizon's unit. A choice: far below any
-# arc that matters, far above the rounding of times.
+# Least distance of successive free knots, as a share of the horizon's unit. Chosen, not tuned: far
+# below any arc that matters, far above the rounding of times.
 _APART = 1e-6
 
 _Side = tuple[Array, Array]  # lower, upper
@@ -89,8 +89,8 @@ def _time_bounds(program: Transcription) -> list[_Side]:
 def _on_arcs(
     program: Transcription, x: list[Array], u: list[Array], h: list[Array]
 ) -> tuple[list[Array], list[Array], list[Array]]:
-    """Bounds of states, controls and path constraints, changed by what is known of each arc: held
-    controls are given, and the states and path constraints that they determine are unbounded."""
+    """Bounds of states, controls and path constraints on arcs: held controls are given, and the
+    states and path constraints that they determine are unbounded."""
     assert program.arcwise is not None
     at = program.arcwise.held[:, None]
     u = [jnp.where(at > 0, u[1], u[0]), jnp.where(at < 0, u[0], u[1])]

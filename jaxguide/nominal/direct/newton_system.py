@@ -20,7 +20,8 @@ from jaxguide.nominal.direct.transcription import Ends, Nodes, Transcription
 from jaxguide.nominal.direct.unknowns import Equations, Primal
 
 # Compliance of path constraints: an equality is a spring of stiffness 1/COMPLIANCE. It regularises
-# as delta_c of Waechter & Biegler (2006), eq. (13) and section 3.1, who take 1e-8 mu^(1/4).
+# as delta_c of Waechter & Biegler (2006), eq. (13) and section 3.1, who take 1e-8 mu^(1/4), and
+# only where the matrix is singular.
 COMPLIANCE = 1e-8
 
 

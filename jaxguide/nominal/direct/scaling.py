@@ -36,7 +36,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     scale = program.scale._replace(x=x, u=u, t=t, p=p)
     program = eqx.tree_at(lambda q: q.scale, program, scale)
     scaled = jax.tree_util.tree_map(jnp.divide, w, program.units)
-    # A unit away too: at rest a gradient may vanish.
+    # Also a unit away from the guess: at rest a gradient may vanish.
     away = scaled._replace(x=scaled.x + 1.0, u=scaled.u + 1.0)
     n, weights = counts.n, jnp.asarray(program.rule.w, dtype)[None, :, None]
     steepest = lambda a, axis: jnp.max(
@@ -44,7 +44,7 @@ def designer_units(program: Transcription, w: Primal) -> Scale:
     )
 
     def slopes(w: Primal) -> tuple[Array, Array, Array]:
-        """Of path constraints, endpoint cost and constraints, and running cost."""
+        """Largest slopes of path constraints, endpoint cost and constraints, and running cost."""
         nodes, ends = program.derivatives(w)
         path = steepest(nodes.jacobian[:, :, n + 1 :], (0, 1, 3))
         return path, steepest(ends.jacobian, 1), steepest(nodes.jacobian[:, :, n] / weights, None)

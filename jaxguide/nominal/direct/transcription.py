@@ -43,7 +43,7 @@ class Transcription(eqx.Module):
     - `scale`: designer units of everything.
     - `edges`: break points, each a linear combination of the times t0, tf and free knots.
     - `family`: of the nodes, see `collocation`.
-    - `arcwise`: what is known of each segment's arc.
+    - `arcwise`: the known structure of each segment's arc.
     - `log`: print the optimiser's iterations.
     """
 
@@ -83,7 +83,7 @@ class Transcription(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """Of every floating number in the program."""
+        """The type of every floating number in the program."""
         return self.edges.dtype
 
     @property
@@ -242,8 +242,8 @@ def hessian(f: Any, argnum: int) -> Any:
 
 
 def clock_order(problem: Problem, clocks: int) -> Float[np.ndarray, "row clock"]:
-    """Rows that give the differences of successive times, which must stay above zero, where knots
-    or both ends are free. (One free end is kept in order by its own bounds.)"""
+    """The matrix from the times to their successive differences, which must stay above zero. It has
+    no rows unless knots or both ends are free: one free end is kept in order by its bounds."""
     sequence = np.eye(clocks)[[0, *range(2, clocks), 1]]
     free = is_free(problem.initial_time) and is_free(problem.final_time)
     return np.diff(sequence, axis=0) if clocks > 2 or free else np.zeros((0, clocks))

@@ -55,7 +55,7 @@ class Scale(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How many of each a transcription has.
+    """Numbers of unknowns and equations of a transcription.
 
     - `n`, `m`: states, controls. `parameters`: optimised static parameters.
     - `path`, `end`: path constraints at a node; endpoint constraints, the order of free times
@@ -76,7 +76,7 @@ class Counts(NamedTuple):
 
 
 class Arcwise(eqx.Module):
-    """What is known of the arc that each segment is part of.
+    """The known structure of the arc that each segment is part of.
 
     - `held`: 1 or -1 where a control is to stay at its upper or lower bound, 0 elsewhere. The sign
       of its multiplier tells whether it should.

@@ -1,4 +1,4 @@
-"""Multipliers of a nearby extremal as a start: the covector mapping of `covectors` undone."""
+"""Multipliers of a nearby extremal as a start: the covector mapping of `covectors`, inverted."""
 
 from typing import Any
 

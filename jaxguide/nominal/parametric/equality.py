@@ -13,9 +13,16 @@ from jaxguide.nominal.roots import implicit_root
 
 Values = Callable[[Array, Any], tuple[Array, Array]]  # (a, args) -> f, c
 
-_STEPS = tuple(0.5**k for k in range(12))  # lengths tried at once
-_NEAR = 1e-2  # scaled steps below which Newton is left alone
-_SEARCH = 1e-9  # KKT residual at which the search hands over to the root finder
+# Of the search, chosen, not tuned; `polished` finds the last digits whatever they are. Step lengths
+# tried at once; scaled step below which a full Newton step is taken unasked; KKT residual at which
+# the search ends.
+_STEPS, _NEAR, _SEARCH = tuple(0.5**k for k in range(12)), 1e-2, 1e-9
+# Shifts of the Hessian, relative to its largest entry: the first, the factor to the next, and the
+# largest. Chosen, not tuned.
+_SHIFT, _GROW, _SHIFT_MAX = 1e-4, 10, 1e8
+# Residual and number of steps at which the root finder ends: rounding, and far more steps than
+# Newton's method takes from `_SEARCH`.
+_ROOT, _ROOT_STEPS = 1e-13, 12
 
 
 class KKTPoint(NamedTuple):
@@ -103,14 +110,15 @@ def local_minimum(
         t = _tangent(d)
         shifted = lambda delta: t.matrix + delta * t.projector
         delta = jax.lax.while_loop(
-            lambda s: ~cholesky_positive(shifted(s)) & (s < 1e8 * t.size),
-            lambda s: jnp.maximum(10 * s, 1e-4 * t.size),
+            lambda s: ~cholesky_positive(shifted(s)) & (s < _SHIFT_MAX * t.size),
+            lambda s: jnp.maximum(_GROW * s, _SHIFT * t.size),
             jnp.zeros_like(t.size),
         )
         along = t.projector @ (d.gradient + d.hessian @ t.normal)
         step = t.normal - t.projector @ gauss_solve(shifted(delta), along)
         length = jnp.max(jnp.abs(step))
         step = step / jnp.maximum(1.0, length)
+        # The merit function is exact above |nu|; twice that and 1 leave room for nu to change.
         weight = 2 * jnp.max(jnp.abs(d.nu), initial=0.0) + 1.0
         merit = lambda f, c: f + weight * jnp.sum(jnp.abs(c))
         sizes = jnp.asarray(_STEPS, a.dtype)
@@ -138,4 +146,4 @@ def local_minimum(
 
 def polished(values: Values, z: KKTPoint, args: Any) -> KKTPoint:
     """`z` by Newton to rounding; differentiable in `args`, implicitly, forward and reverse."""
-    return implicit_root(lambda z, args: conditions(values, z, args), z, args, 1e-13, 12)
+    return implicit_root(lambda z, args: conditions(values, z, args), z, args, _ROOT, _ROOT_STEPS)

@@ -70,7 +70,8 @@ def _costates(
     end: Float[Array, " n"],
     points: Array,
 ) -> Float[Array, "node n"]:
-    """The adjoint of the flow, eq. (6), backwards from its end, the state flown back beside it."""
+    """The adjoint of the flow, 2002 paper, eq. (6), backwards from its end, the state flown back
+    beside it."""
     n, (t0, tf) = problem.n, (t[0], t[-1])
 
     def back(carry: Array, part: tuple) -> tuple[Array, Array]:

@@ -1,5 +1,8 @@
-"""A control as parameters: piecewise linear in normalised time, with the final time (thesis, eqs
-2.5-2.13). What they lead to, from the start or from anywhere on the way."""
+"""A control as parameters, the values at its nodes and the final time, and the trajectory that they
+give, from the start or from anywhere on the way. Linear between nodes, in normalised time.
+
+**Source:** Libby's thesis, eqs (2.5)-(2.13).
+"""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxguide.bounds import bounds_of
 from jaxguide.nominal.steps import dopri8
 from jaxguide.problem import Problem, initial_values, is_free
-from jaxguide.spectral import nodes_lgl
+from jaxguide.spectral import interval, nodes_lgl
 
 
 class Departure(NamedTuple):
@@ -25,7 +28,7 @@ class Departure(NamedTuple):
 
 
 def pack(problem: Problem, controls: Float[Array, "k m"], tf: Any) -> Float[Array, " p"]:
-    """a = (u_1, ..., u_k, tf), eq. (2.9); without tf where it is given."""
+    """a = (u_1, ..., u_k, tf), thesis, eq. (2.9); without tf where it is given."""
     flat = controls.reshape(-1)
     return jnp.append(flat, tf) if is_free(problem.final_time) else flat
 
@@ -40,16 +43,11 @@ def unpack(problem: Problem, a: Float[Array, " p"]) -> tuple[Float[Array, "k m"]
 def control_at(
     positions: Float[Array, " k"], controls: Float[Array, "k m"], tau: Any
 ) -> Float[Array, " m"]:
-    """The control at the scalar `tau`, eqs (4.30)-(4.31); past the ends the last slope goes on."""
+    """The control at the scalar `tau`, thesis, eqs (4.30)-(4.31); beyond the ends, the line of the
+    nearest interval."""
     i = interval(positions, tau)
     share = (tau - positions[i]) / (positions[i + 1] - positions[i])
     return controls[i] + share * (controls[i + 1] - controls[i])
-
-
-def interval(positions: Float[Array, " k"], tau: Any) -> Array:
-    """Index of the interval that holds `tau`; of the nearest one beyond the ends."""
-    after = jnp.searchsorted(positions, tau, side="right", method="compare_all")
-    return jnp.clip(after - 1, 0, positions.shape[0] - 2)
 
 
 def fly(
@@ -64,10 +62,8 @@ def fly(
     Intervals that begin before `start` begin there instead, with their control: the parameter of
     the last node passed is then the control at `start`, and earlier ones do nothing.
     """
-    controls, tf = unpack(problem, a)
-    t0 = jnp.asarray(problem.initial_time, a.dtype)
-    span = tf - t0
-    begin = t0 + start.tau * span if start.t is None else start.t
+    controls, _ = unpack(problem, a)
+    _, span, begin = _clock(problem, a, start)
     positions = jnp.maximum(positions, start.tau)
     points = jnp.asarray((nodes_lgl(degree + 1)[0] + 1) / 2, a.dtype)
 
@@ -78,7 +74,7 @@ def fly(
             t, u = begin + span * (tau - start.tau + width * s), left + s * (right - left)
             x = y[:-1]
             rates = jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u))
-            return width * span * rates  # eq. (2.7)
+            return width * span * rates  # thesis, eq. (2.7)
 
         ys = dopri8(rate, y, points)
         return ys[-1], ys
@@ -88,6 +84,13 @@ def fly(
     return jax.lax.scan(across, y, parts)[1]
 
 
+def _clock(problem: Problem, a: Float[Array, " p"], start: Departure) -> tuple[Array, Array, Array]:
+    """t0, the length of the whole horizon, and the time of `start`."""
+    t0 = jnp.asarray(problem.initial_time, a.dtype)
+    span = unpack(problem, a)[1] - t0
+    return t0, span, t0 + start.tau * span if start.t is None else start.t
+
+
 def outcome(
     problem: Problem,
     positions: Float[Array, " k"],
@@ -95,12 +98,10 @@ def outcome(
     start: Departure,
     degree: int,
 ) -> tuple[Float[Array, ""], Float[Array, " q"], Float[Array, " n"]]:
-    """Cost and endpoint constraints (less their targets) from `start` on, eqs (2.12)-(2.13); and
-    the state at the end."""
+    """Cost and endpoint constraints (less their targets) from `start` on, and the state at the end:
+    thesis, eqs (2.12)-(2.13)."""
     end = fly(problem, positions, a, start, degree)[-1, -1]
-    t0 = jnp.asarray(problem.initial_time, a.dtype)
-    span = unpack(problem, a)[1] - t0
-    begin = t0 + start.tau * span if start.t is None else start.t
+    t0, span, begin = _clock(problem, a, start)
     ends = (initial_values(problem, a.dtype), end[:-1], t0, begin + (1 - start.tau) * span)
     e = problem.endpoint_constraints(*ends)
     e = e - bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)[0]

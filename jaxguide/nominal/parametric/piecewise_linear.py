@@ -30,18 +30,21 @@ from jaxguide.problem import (
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS, is_traced
 
-_ITERATIONS = 100  # of Newton from one start: a choice, far more than a good start takes
-# Scaled KKT residual up to which a solution counts as converged, and a start before it is polished.
+# Newton's steps from one start: chosen, not tuned, far more than a good start takes.
+_ITERATIONS = 100
+# Scaled KKT residual up to which a solution counts as converged, some 1e4 roundings, and a start as
+# worth polishing, from where Newton's method doubles the digits with each step.
 _TOLERANCE, _FOUND = 1e-12, 1e-6
-_WITHIN = 1e-9  # by how much, of its size, a bound may be overstepped
+# By how much of its size a bound may be overstepped: the method's `accuracy`.
+_WITHIN = 1e-9
 # Random starts: half the range of a control without bounds, in its units; a horizon within twice
-# the guess (log 2 = 0.7). Choices.
+# the guess (log 2 = 0.7). Chosen, not tuned.
 _HALF, _SPREAD = 1.0, 0.7
 
 
 class PiecewiseLinear(Method):
     """Suboptimal control: node values of a piecewise-linear control, and a free final time, that
-    minimise the cost subject to the endpoint constraints, eqs (2.5)-(2.13).
+    minimise the cost subject to the endpoint constraints.
 
     The flow is by Dormand-Prince steps of order eight, `degree` to an interval; the parameters by
     Newton on the KKT system with exact second derivatives, from a constant control and from random
@@ -59,7 +62,7 @@ class PiecewiseLinear(Method):
 
     **Raises:** `ValueError` for nodes that are too few, out of order, repeated, or not from 0 to 1.
 
-    **Source:** Libby's thesis, chapter 2; Hull & Helfrich (1992).
+    **Source:** Libby's thesis, eqs (2.5)-(2.13); Hull & Helfrich (1992).
     """
 
     positions: Float[Array, " k"]
@@ -184,7 +187,7 @@ class PiecewiseLinear(Method):
 
 
 class Units(NamedTuple):
-    """What parameters, cost and constraints are measured in."""
+    """Units of parameters, cost and constraints."""
 
     a: Float[Array, " p"]
     f: Float[Array, ""]
@@ -192,7 +195,7 @@ class Units(NamedTuple):
 
 
 def _control_units(problem: Problem) -> Float[Array, " m"]:
-    """What a control amounts to, by its bounds or, far from 1, by what its motion must achieve."""
+    """The `natural_units` of the controls, on a straight line between the nearest ends."""
     dtype = jnp.result_type(float)
     t0 = jnp.asarray(problem.initial_time, dtype)
     tf = jnp.asarray(start_value(problem.final_time), dtype)
@@ -204,8 +207,8 @@ def _control_units(problem: Problem) -> Float[Array, " m"]:
 def _units(
     problem: Problem, positions: Array, of_u: Float[Array, " m"], degree: int, a: Array
 ) -> Units:
-    """The final time by its own value, controls without bounds by `of_u`, the others by one; cost
-    and constraints by their gradients there."""
+    """Units: of a free final time its value, of controls without bounds `of_u`, of the others 1; of
+    cost and constraints their largest slopes at the parameters `a`."""
     lo, hi = bounds_of(problem.control_bounds, problem.m, a.dtype)
     of_u = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), 1.0, of_u)
     size = jnp.tile(of_u, positions.shape[0])

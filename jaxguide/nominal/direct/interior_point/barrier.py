@@ -21,21 +21,24 @@ from jaxguide.nominal.direct.interior_point.evaluation import Iterate
 from jaxguide.nominal.direct.interior_point.state import Options, Setup
 from jaxguide.nominal.direct.trees import along
 
-# kappa_eps, kappa_mu, theta_mu and tau_min: Waechter & Biegler (2006), eqs (7) and (8).
+# kappa_eps, kappa_mu, theta_mu and tau_min: Waechter & Biegler (2006), section 2.1, eqs (7) and
+# (8).
 _KAPPA_EPS, _KAPPA_MU, _THETA_MU, _TAU_MIN = 10.0, 0.2, 1.5, 0.99
-# Least barrier, of the tolerance: Waechter & Biegler (2006), eq. (7), where it is 1/10.
+# The least barrier is the tolerance over this: Waechter & Biegler (2006), eq. (7).
 _LEAST = 10
 # The barrier is free while the error falls below `_FALL` of its worst at the last `MEMORY` iterates
 # with a free barrier: Ipopt, adaptive_mu_kkterror_red_fact and adaptive_mu_kkterror_red_iters.
 _FALL, MEMORY = 0.9999, 4
-# Share of the complementarity at which a held barrier begins: Ipopt,
+# Share of the mean complementarity at which a held barrier begins: Ipopt,
 # adaptive_mu_monotone_init_factor.
 _HELD = 0.8
-# Barrier below which it may be free, and the share of the error that a free one stays above. By
-# experiment: free from the start, or where the problem is not convex, NPSAT1 took three times the
-# iterations.
+# The barrier is free only below `_NEAR`. By experiment: free from the start, or where the problem
+# is not convex, NPSAT1 took three times the iterations. A free one stays above `_AHEAD` of the
+# error, lest complementarity hold long before the other conditions: chosen, no experiment is
+# recorded.
 _NEAR, _AHEAD = 1e-3, 1e-4
-# Largest barrier of a probe: a choice, a thousand times that of a cold start.
+# Largest barrier of a probe: Ipopt, mu_max_fact, times the 0.1 of a cold start (where Ipopt takes
+# the mean complementarity).
 _MU_MAX = 1e2
 _CENTRING = 3  # Mehrotra's exponent, as in Nocedal, Waechter & Waltz (2009)
 
@@ -53,7 +56,7 @@ class Barrier(NamedTuple):
 
 def barrier_of(setup: Setup, at: Iterate, delta: Float[Array, ""]) -> Barrier:
     """Free to follow a probe near a convex solution (`delta` = 0) while the error falls. Otherwise
-    mu stays (monotone mode), from a share of the complementarity found, until the barrier problem
+    (monotone mode) mu begins at a share of the complementarity and stays until the barrier problem
     is solved to kappa_eps mu; then it falls.
 
     **Source:** Waechter & Biegler (2006), eqs (7) and (8).
@@ -69,14 +72,14 @@ def barrier_of(setup: Setup, at: Iterate, delta: Float[Array, ""]) -> Barrier:
     lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
     solved = lambda mu: newton & ~free & (at.error(mu) <= _KAPPA_EPS * mu) & (mu > least)
     mu = jax.lax.while_loop(solved, lower, held)
-    # Waechter & Biegler (2006), eq. (8); with a free barrier the error stands for mu.
+    # Waechter & Biegler (2006), eq. (8); with a free barrier from the error, as in Ipopt.
     tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(free, now, mu))
     return Barrier(mu, free, tau, gap, errors)
 
 
 def probed(setup: Setup, at: Iterate, barrier: Barrier, step: Move) -> Float[Array, ""]:
-    """Mehrotra's rule: mu = sigma gap with sigma = (gap after the step / gap)^3, for the longest
-    `step` that was taken towards mu = 0.
+    """Mehrotra's rule: mu = sigma gap with sigma = (gap after the step / gap)^3, the step being as
+    much of `step`, computed for mu = 0, as the bounds allow.
 
     **Source:** Nocedal, Waechter & Waltz (2009), Mehrotra's probing heuristic.
     """

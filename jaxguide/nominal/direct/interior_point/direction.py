@@ -3,9 +3,9 @@
 Three kinds of step share one matrix, so that the factorisation is compiled once:
 
 - Newton's: W of the Lagrangian, Sigma of the barrier; Waechter & Biegler (2006), eq. (11).
-- towards feasibility: W = 0, and sqrt(mu) I in its stead: the least step, weighted by the barrier,
-  that meets the linearised constraints (their section 3.3).
-- an estimate of the multipliers: W + Sigma = I, by least squares (their section 3.6).
+- towards feasibility: W = sqrt(mu) I: the least step, weighted by the barrier, that meets the
+  linearised constraints. (They minimise the violation plus such a term, eq. (29a), instead.)
+- an estimate of the multipliers: W + Sigma = I, by least squares; their eq. (36).
 """
 
 from typing import Any, NamedTuple
@@ -29,10 +29,10 @@ from jaxguide.nominal.direct.newton_system import (
 from jaxguide.nominal.direct.trees import choose, largest, zeros_like
 from jaxguide.nominal.direct.unknowns import Equations, Primal, flattened
 
-# Algorithm IC of Waechter & Biegler (2006), section 3.1: delta_w^min, delta_w^0, kappa_w^-,
-# kappa_w^+ and its value before any correction.
+# Algorithm IC of Waechter & Biegler (2006), section 3.1: delta_w^min, delta_w^0, 1/kappa_w^-,
+# kappa_w^+ and, before the first correction, its value with a bar.
 _DELTA_MIN, _DELTA_FIRST, _FALL, _GROW, _GROW_FIRST = 1e-20, 1e-4, 3, 8.0, 100.0
-# Theirs, delta_w^max, is 1e40; with 1e12 the Hessian is already lost in rounding.
+# Their delta_w^max is 1e40; beside 1e12 a scaled Hessian is already down to its first digits.
 _DELTA_MAX = 1e12
 # Curvature lent to free knots, lest one that nothing needs wander. By experiment, the best of five
 # values tried on such knots.
@@ -40,7 +40,7 @@ _IDLE = 1e-3
 
 
 class Matrix(NamedTuple):
-    """The Newton matrix, factorised. `delta`: what its Hessian was regularised by; `regular`:
+    """The Newton matrix, factorised. `delta`: its Hessian's regularisation; `regular`:
     whether its inertia is right; `needed`: the last positive delta that a Newton step needed."""
 
     system: NewtonSystem
@@ -52,7 +52,7 @@ class Matrix(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Of the objective, and of the barrier with mu = 1."""
+    """Gradients of the objective, and of the barrier with mu = 1."""
 
     objective: Float[Array, " unknown"]
     barrier: Float[Array, " unknown"]
@@ -66,7 +66,7 @@ class Move(NamedTuple):
 
 
 def gradients_of(setup: Setup, at: Iterate) -> Gradients:
-    """First derivatives that directions and slopes are made of."""
+    """The Gradients at an iterate."""
     program, w = setup.program, setup.program.shaped(at.state.w)
     of = lagrangian_gradient(program, at.nodes, at.ends, w, zeros_like(at.state.y))
     pull = barrier_gradient(setup.box, at.low, at.high, jnp.ones_like(at.state.mu))
@@ -92,8 +92,8 @@ def factorised(setup: Setup, at: Iterate) -> Matrix:
 
 
 def _sigma(setup: Setup, at: Iterate) -> Primal:
-    """The barrier's curvature z/distance; for an estimate, 1 of the slacks alone (the others have
-    theirs by regularisation)."""
+    """The barrier's curvature z/distance; for an estimate, 1 for slacks and 0 for the others, to
+    which the regularisation adds 1."""
     program, s = setup.program, at.state
     w = program.shaped(s.w)
     on = {name: name in ("path", "end") for name in Primal._fields}
@@ -107,7 +107,7 @@ def _corrected(
     factorise_with: Any, first: Array, last: Array
 ) -> tuple[Array, Factor, Bool[Array, ""]]:
     """Regularisation from `first` up, until the inertia is right: Waechter & Biegler (2006),
-    Algorithm IC. `last`: what was needed before, or 0."""
+    Algorithm IC. `last`: the last one that was needed, or 0."""
 
     def attempt(carry: tuple) -> tuple:
         delta, _, _ = carry

@@ -18,8 +18,8 @@ _tree = jax.tree_util.tree_map
 
 # s_max, mean multiplier above which errors are scaled: Waechter & Biegler (2006), after eq. (6).
 _S_MAX = 100.0
-# Bound on their s_d: multipliers may not excuse more than this of the gradient (a choice: redundant
-# constraints let multipliers grow, and with them s_d, without bound).
+# Bound on their s_d. Redundant constraints let multipliers, and with them s_d, grow without bound;
+# this keeps the Lagrangian's gradient below 1e4 times the tolerance. Chosen, not tuned.
 _S_D_MAX = 1e4
 
 
@@ -52,7 +52,7 @@ def optimality_error(
     """mu -> E_mu, the worst scaled violation of the perturbed first-order conditions; `gradient`:
     of f + y^T c.
 
-    **Source:** Waechter & Biegler (2006), eqs (4)-(6).
+    **Source:** Waechter & Biegler (2006), eqs (4) and (5); s_d and s_c, after eq. (6).
     """
     net = _tree(lambda g, a, b: g - a + b, gradient, zl, zu)
     net = _tree(lambda g, given: jnp.where(given, 0.0, g), net, box.given)

@@ -1,5 +1,5 @@
-"""The filter: pairs of constraint violation theta and barrier function phi that a trial point must
-not be dominated by.
+"""The filter: pairs of constraint violation theta and barrier function phi, none of which may be at
+least as good as a trial point in both.
 
 **Source:** Waechter & Biegler (2006), section 2.3.
 """
@@ -13,8 +13,8 @@ from jaxguide.nominal.direct.trees import choose
 
 # gamma_theta and gamma_phi, margins of sufficient progress: Waechter & Biegler (2006), eq. (18).
 GAMMA = 1e-5
-# Pairs that the filter holds; the oldest makes way. A choice: the filter empties whenever the
-# barrier changes.
+# Pairs that the filter holds; a further one takes the place of the oldest. Chosen, not tuned: the
+# filter is emptied whenever the barrier changes.
 _SLOTS = 128
 
 

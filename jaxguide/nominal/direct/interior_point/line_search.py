@@ -28,20 +28,20 @@ from jaxguide.nominal.direct.unknowns import Equations
 # delta, s_theta and s_phi of the switching condition, and eta_phi of Armijo's: Waechter & Biegler
 # (2006), eqs (19) and (20).
 _DELTA, _S_THETA, _S_PHI, _ETA = 1.0, 1.1, 2.3, 1e-4
-# Decrease of the violation that restoration asks of a step, as eta_phi above.
+# Armijo's factor for the violation, in restoration: the value of eta_phi.
 _NEARER = 1e-4
-# Room for rounding in (18b) and (20), of 1 + |phi|: ten times that of Waechter & Biegler (2006),
-# who take 10 roundings of |phi| (a choice).
+# Room for rounding of phi in eqs (18) and (20), in roundings of 1 + |phi|. Ipopt allows 10
+# roundings of |phi|; ten times that, and of 1 where phi is small: chosen, not tuned.
 _ROUNDINGS = 1e2
 # Halvings before a step counts as failed: 2^-30 is about 1e-9, where a step is lost in rounding.
 _HALVINGS = 30
-# Share of the horizon that one step may take away: a model that is linear in time would throw most
-# of it away, from guesses that stand still (a choice).
+# Largest share of the horizon that one step may remove. From a guess at rest, a model linear in
+# time would remove most of it. Chosen, not tuned.
 _SHRINK = 0.5
 
 
 class Search(NamedTuple):
-    """What stays fixed while lengths are tried. `theta`: violation, the 1-norm of the constraints;
+    """Fixed while lengths are tried. `theta`: violation, the 1-norm of the constraints;
     `logs`: the barrier function with mu = 1 and no objective."""
 
     setup: Setup
@@ -54,8 +54,8 @@ class Search(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Of a trial point: whether it is acceptable; whether as a step of f-type, which decreases the
-    barrier function and leaves the filter as it is; its constraints and violation."""
+    """Whether a trial point is acceptable; whether as a step of f-type, which decreases the barrier
+    function and leaves the filter as it is; the point's constraints and violation."""
 
     ok: Bool[Array, ""]
     f_type: Bool[Array, ""]
@@ -79,7 +79,7 @@ class Aim(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the search ends with: the barrier and its filter, the uncorrected step, the step taken
+    """The result of the search: the barrier and its filter, the uncorrected step, the step taken
     and its length, violation `theta` and barrier function `phi` before it, whether it is
     `accepted`, and as an f-type step; `regular`: whether the step could be computed at all."""
 
@@ -124,10 +124,10 @@ def searched(
 
 
 def _aimed(search: Search) -> Aim:
-    """The full step and whether all of it is acceptable; if it adds to the violation, once more,
-    corrected to the second order. Before, where the barrier is free, a probe: a step without one.
+    """The full step and whether it is acceptable; if it is not, and adds to the violation, its
+    second-order correction. Where the barrier is free, first a probe: a step without barrier.
 
-    **Source:** Waechter & Biegler (2006), eq. (27), with one correction.
+    **Source:** Waechter & Biegler (2006), section 2.4, eq. (27); at most one correction, not four.
     """
     setup, at, matrix, gradients, barrier, theta, _ = search
     s, kind = at.state, at.kind
@@ -162,8 +162,8 @@ def _aimed(search: Search) -> Aim:
 def judged_trial(
     search: Search, mu: Array, alpha: Array, slope: Array, d: Array, length: Array
 ) -> Judgement:
-    """Whether the move by `length` d is acceptable as a step of size `alpha`, whose barrier
-    function has the `slope` ahead.
+    """Whether the point `length` along d is acceptable, judged as a step of size `alpha` along
+    which the barrier function begins with `slope`.
 
     **Source:** Waechter & Biegler (2006), eqs (18)-(20).
     """

@@ -29,8 +29,8 @@ from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.trees import largest, one_norm
 from jaxguide.nominal.direct.unknowns import flattened
 
-# Violations above which nothing is acceptable, and below which the switching condition counts, of
-# the first one or 1: Waechter & Biegler (2006), eqs (21) and (19).
+# Violations above which no point is acceptable, and below which the switching condition counts,
+# relative to the first violation or 1: Waechter & Biegler (2006), eq. (21), and before eq. (19).
 _THETA_MAX, _THETA_MIN = 1e4, 1e-4
 
 

@@ -55,7 +55,7 @@ class Solution(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What stays fixed during the iterations; the box holds vectors."""
+    """The problem, fixed during the iterations; the box holds vectors."""
 
     program: Transcription
     box: Box
@@ -63,12 +63,12 @@ class Setup(NamedTuple):
 
 
 class State(NamedTuple):
-    """What passes from step to step. Unknowns and bounds' multipliers are vectors: in a loop, a
-    leaf of a pytree costs as much as all of them.
+    """Passed from step to step. Unknowns and bounds' multipliers are vectors: in a loop, each leaf
+    of a pytree costs as much as a whole vector.
 
     - `w`, `y`, `zl`, `zu`, `mu`, `filter`: the iterate, its barrier and filter.
-    - `theta_max`, `theta_min`: violations above which nothing is acceptable, and below which the
-      switching condition counts; Waechter & Biegler (2006), eqs (19) and (21).
+    - `theta_max`, `theta_min`: violations above which no point is acceptable, and below which the
+      switching condition counts; Waechter & Biegler (2006), eq. (21), and before eq. (19).
     - `theta_entry`: violation at which restoration began.
     - `delta`: the last regularisation that was needed, delta_w^last of their Algorithm IC.
     - `free`: whether the barrier followed a probe; otherwise it is held until its problem is

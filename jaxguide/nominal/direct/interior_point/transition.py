@@ -1,4 +1,4 @@
-"""The next state: the new iterate, its bounds' multipliers, and what kind of step comes next."""
+"""The next state: the new iterate, its bounds' multipliers, and the kind of the next step."""
 
 from typing import NamedTuple
 
@@ -30,14 +30,15 @@ from jaxguide.nominal.direct.unknowns import Equations
 # kappa_Sigma, the bounds' multipliers within this factor of mu/distance: Waechter & Biegler (2006),
 # eq. (16).
 _KAPPA_SIGMA = 1e10
-# Largest first estimate of a multiplier: lambda_max of Waechter & Biegler (2006), section 3.6; a
-# larger one is worth less than none.
+# Largest first estimate of a multiplier: lambda_max of Waechter & Biegler (2006), section 3.6. If
+# any is larger, all are 0.
 _MULTIPLIERS_MAX = 1e3
 # Restoration ends at this share of the violation at which it began: kappa_resto of Waechter &
-# Biegler (2006), section 3.3. It also ends at a violation of a tenth of the tolerance (a choice).
+# Biegler (2006), section 3.3. It also ends at a violation of a tenth of the tolerance, which leaves
+# nothing to restore: chosen, not tuned.
 _KAPPA_RESTO, _FEASIBLE = 0.9, 10
-# A failed step at a violation below the tolerance, but at least this, has stalled; otherwise the
-# problem is infeasible. A choice: a root of rounding.
+# If a step fails at a violation below this or the tolerance, the larger, the search has stalled;
+# otherwise the problem is infeasible. Chosen, not tuned: the square root of rounding.
 _LEAST_VIOLATION = 1e-8
 
 
@@ -51,8 +52,8 @@ class Moved(NamedTuple):
 
 
 class Restoration(NamedTuple):
-    """What a step means for feasibility restoration: whether it is over (`home`), must begin
-    (`into`), or failed (`stuck`)."""
+    """Whether a step ended feasibility restoration (`home`), makes it necessary (`into`), or failed
+    in it (`stuck`)."""
 
     home: Bool[Array, ""]
     into: Bool[Array, ""]
@@ -93,7 +94,7 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
 def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Moved:
     """The new iterate, if the step was accepted; new multipliers alone, after an estimate.
 
-    **Source:** Waechter & Biegler (2006), eqs (14)-(16); section 3.6 for the estimate.
+    **Source:** Waechter & Biegler (2006), eqs (14)-(16); eq. (36) for the estimate.
     """
     s, kind, box, mu, d = at.state, at.kind, setup.box, found.mu, found.taken.primal
     dzl, dzu = bound_multiplier_step(setup, at, mu, d)
@@ -122,7 +123,7 @@ def _restoration_after(setup: Setup, at: Iterate, point: Moved, found: Found) ->
     **Source:** Waechter & Biegler (2006), section 3.3.
     """
     (program, box, options), s, kind = setup, at.state, at.kind
-    # Asked after restoration alone: otherwise no evaluation is spent.
+    # Only restoration needs the new values: other steps save the evaluation.
     evaluate = lambda: program.objective_and_residual(program.shaped(point.w))
     f, c = jax.lax.cond(kind.restore, evaluate, lambda: (at.f, at.c))
     theta, phi = one_norm(c), f + barrier_value(box, point.w, found.mu)
