@@ -16,6 +16,7 @@ Values = Callable[[Array, Any], tuple[Array, Array]]  # (a, args) -> f, c
 _STEPS = tuple(0.5**k for k in range(12))  # lengths tried at once
 _NEAR = 1e-2  # scaled steps below which Newton is left alone
 _SEARCH = 1e-9  # KKT residual at which the search hands over to the root finder
+_LAST, _LAST_STEPS = 1e-13, 12  # of the root finder: its last relative step, and the residual there
 
 
 class KKTPoint(NamedTuple):
@@ -138,4 +139,5 @@ def local_minimum(
 
 def polished(values: Values, z: KKTPoint, args: Any) -> KKTPoint:
     """`z` by Newton to rounding; differentiable in `args`, implicitly, forward and reverse."""
-    return implicit_root(lambda z, args: conditions(values, z, args), z, args, 1e-13, 12)
+    missed = lambda z, args: conditions(values, z, args)
+    return implicit_root(missed, z, args, _LAST, _LAST_STEPS, within=_LAST)
