@@ -367,7 +367,7 @@ def test_a_root_that_is_none_has_no_derivative():
     def root(a):
         missed = lambda y, a: y**2 - a
         y = implicit_root(missed, jnp.full(1, 3.0), a, 1e-14, 40)
-        return differentiable_if(jnp.abs(missed(y, a)[0]) < 1e-12, y)[0]
+        return differentiable_if(jnp.abs(missed(y, a)[0]) < 1e-12, y, a)[0]
 
     a = jnp.array([4.0, jnp.nan, -1.0, 9.0])  # a square root, nothing, none, another one
     for gradient in (jax.grad(root), jax.jacfwd(root)):

@@ -86,21 +86,24 @@ def _twice(out: Array) -> tuple[Array, Array]:
     return out, out
 
 
-def differentiable_if(good: Bool[Array, ""], tree: Unknown) -> Unknown:
-    """`tree`, with derivatives that are NaN unless `good`: where no root was found the implicit
-    derivative is a number that means nothing."""
+def differentiable_if(good: Bool[Array, ""], tree: Unknown, of: Any) -> Unknown:
+    """`tree`, a function of `of`, with derivatives that are NaN unless `good`: where no root was
+    found the implicit derivative is a number that means nothing."""
     numbers, others = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(_guarded(numbers, good), others)
+    return eqx.combine(_guarded(numbers, good, eqx.filter(of, eqx.is_inexact_array)), others)
 
 
 @jax.custom_jvp
-def _guarded(tree: Any, good: Bool[Array, ""]) -> Any:
-    del good
+def _guarded(tree: Any, good: Bool[Array, ""], of: Any) -> Any:
+    del good, of
     return tree
 
 
 @_guarded.defjvp
 def _guarded_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-    (tree, good), (moved, _) = primals, tangents
-    times = lambda t: t * jnp.where(good, 1.0, jnp.nan).astype(t.dtype)
+    (tree, good, _), (moved, _, cause) = primals, tangents
+    # By its cause too: a NaN parameter that only comparisons look at reaches no part of `tree`.
+    causes = jnp.asarray(sum(jnp.sum(t) for t in jax.tree_util.tree_leaves(cause)))
+    lost = jnp.where(good, 0.0, causes) * jnp.where(good, 0.0, jnp.nan)
+    times = lambda t: t * jnp.where(good, 1.0, jnp.nan).astype(t.dtype) + lost.astype(t.dtype)
     return tree, jax.tree_util.tree_map(times, moved)

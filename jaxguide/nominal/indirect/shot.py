@@ -93,7 +93,7 @@ def _extremal(
     still = jax.lax.stop_gradient(extremal)
     size = still.sizes()
     worst = _worst(problem, size, *jax.lax.stop_gradient((z, ends)))
-    extremal = differentiable_if(worst <= _CONVERGED, extremal)
+    extremal = differentiable_if(worst <= _CONVERGED, extremal, problem)
     return dataclasses.replace(extremal, residual=worst, result=judged(still, size, worst))
 
 

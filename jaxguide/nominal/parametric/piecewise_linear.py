@@ -154,7 +154,7 @@ class PiecewiseLinear(Method):
             degree=self.degree,
             residual=error,
         )
-        extremal = differentiable_if(error <= _TOLERANCE, extremal)
+        extremal = differentiable_if(error <= _TOLERANCE, extremal, problem)
         result = RESULTS.where(minimal[best], RESULTS.successful, RESULTS.not_minimising)
         result = RESULTS.where(_within_bounds(extremal), result, RESULTS.bounds_violated)
         result = RESULTS.where(error <= _TOLERANCE, result, RESULTS.parameters_not_found)
