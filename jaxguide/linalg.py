@@ -6,10 +6,8 @@ batched QR is a loop. The matrices of guidance are small (2n by 2n), so eliminat
 
 from typing import Any
 
-import equinox.internal as eqxi
-import jax.flatten_util
+import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 # Up to this size elimination is unrolled, so that XLA fuses it: by experiment on the 2n x 2n
@@ -118,44 +116,6 @@ def left_null_space(
     basis = jnp.eye(rows, dtype=a.dtype) - reduced.T @ onehot  # row r: e_r - sum reduced[k,r] e_pk
     order = jnp.argsort(jnp.where(free, index, rows + index))[: rows - cols]
     return basis[order], t.T @ onehot
-
-
-class SmallLU(lx.AbstractLinearSolver):
-    """Lineax solver for small square systems by the elimination of `gauss_solve`, so that batches
-    need no LAPACK.
-
-    **Raises:** `ValueError` for an operator that is not square.
-    """
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        del options
-        if operator.in_size() != operator.out_size():
-            raise ValueError(
-                f"SmallLU needs a square operator, got {operator.out_size()} equations in "
-                f"{operator.in_size()} unknowns."
-            )
-        structures = eqxi.Static((operator.in_structure(), operator.out_structure()))
-        return operator.as_matrix(), structures
-
-    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> Any:
-        del options
-        matrix, structures = state
-        flat, _ = jax.flatten_util.ravel_pytree(vector)
-        in_structure, _ = structures.value
-        zeros = jax.tree_util.tree_map(lambda s: jnp.zeros(s.shape, s.dtype), in_structure)
-        _, unravel = jax.flatten_util.ravel_pytree(zeros)
-        return unravel(_gauss(matrix, flat[:, None])[:, 0]), lx.RESULTS.successful, {}
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        matrix, structures = state
-        return (matrix.T, eqxi.Static(structures.value[::-1])), options
-
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        matrix, structures = state
-        return (matrix.conj(), structures), options
-
-    def assume_full_rank(self) -> bool:
-        return True
 
 
 def power_of_two(size: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -2,12 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxguide.linalg import SmallLU, cholesky_positive, gauss_solve, left_null_space
+from jaxguide.linalg import cholesky_positive, gauss_solve, left_null_space
 
 EPS = np.finfo(float).eps
 
@@ -114,22 +113,3 @@ def test_left_null_space_eliminates_by_unit_columns():
     a = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 2.0], [3.0, 4.0]])
     basis, _ = left_null_space(a)
     np.testing.assert_array_equal(basis[0], [1.0, 0.0, 0.0, 0.0])
-
-
-def test_small_lu_serves_lineax():
-    a, b = jnp.asarray(matrix(4)), jnp.asarray(matrix(4, 1)[:, 0])
-    split = lambda v: {"p": v[:1], "q": v[1:].reshape(3)}
-    join = lambda tree: jnp.concatenate([tree["p"], tree["q"]])
-    operator = lx.FunctionLinearOperator(
-        lambda tree: split(a @ join(tree)), jax.eval_shape(lambda: split(b))
-    )
-    for op, matrix_ in ((operator, a), (operator.T, a.T)):
-        got = join(lx.linear_solve(op, split(b), SmallLU()).value)
-        np.testing.assert_allclose(got, np.linalg.solve(matrix_, b), rtol=1e-11)
-    forward = jax.jit(lambda a: lx.linear_solve(lx.MatrixLinearOperator(a), b, SmallLU()).value)
-    check_grads(forward, (a,), order=1, modes=["fwd", "rev"])
-
-
-def test_small_lu_refuses_rectangles():
-    with pytest.raises(ValueError, match="3 equations in 2 unknowns"):
-        lx.linear_solve(lx.MatrixLinearOperator(jnp.ones((3, 2))), jnp.ones(3), SmallLU())

@@ -17,6 +17,7 @@ from scipy import integrate, optimize
 
 import jaxguide as jg
 from jaxguide.nominal.indirect.shot import judged
+from jaxguide.nominal.roots import differentiable_if, implicit_root
 from jaxguide.problems.earth_mars import EarthMars
 from jaxguide.reproduce.earth_mars.published import ANGLES, COSTATE_END, COSTATE_START, RADIUS
 
@@ -362,9 +363,37 @@ def test_controls_that_do_not_minimise_are_refused(regulator, r):
         jg.solve(dataclasses.replace(Regulator(), r=r), SMALL)
 
 
+def test_a_root_that_is_none_has_no_derivative():
+    def root(a):
+        missed = lambda y, a: y**2 - a
+        y = implicit_root(missed, jnp.full(1, 3.0), a, 1e-14, 40)
+        return differentiable_if(jnp.abs(missed(y, a)[0]) < 1e-12, y, a)[0]
+
+    a = jnp.array([4.0, jnp.nan, -1.0, 9.0])  # a square root, nothing, none, another one
+    for gradient in (jax.grad(root), jax.jacfwd(root)):
+        slope = jax.jit(jax.vmap(gradient))(a)
+        np.testing.assert_allclose(slope, [1 / 4, jnp.nan, jnp.nan, 1 / 6], rtol=1e-14)
+    curvature = jax.vmap(jax.grad(jax.grad(root)))(a)
+    np.testing.assert_allclose(curvature, [-1 / 32, jnp.nan, jnp.nan, -1 / 108], rtol=1e-14)
+    np.testing.assert_allclose(jax.vmap(root)(a[::3]), [2.0, 3.0], rtol=1e-15)
+
+
+def test_a_failure_in_a_batch_spoils_only_its_own_gradient(earth_mars):
+    def radius(thrust):
+        e = jg.solve(EarthMars(thrust=thrust), SMALL, guess=earth_mars)
+        return e.x[-1, 0]
+
+    thrust = EarthMars().thrust
+    batch = jnp.array([thrust, jnp.nan, 0.0, thrust])  # without thrust the end is out of reach
+    slope = jax.jit(jax.vmap(jax.grad(radius)))(batch)
+    # The reference is a finite difference, good to some 1e-9.
+    np.testing.assert_allclose(slope[::3], D_RADIUS_D_THRUST, rtol=1e-8)
+    assert np.all(np.isnan(slope[1:3]))
+
+
 def test_not_minimising_is_told_apart(earth_mars):
-    e = earth_mars
-    judge = lambda u: judged(dataclasses.replace(e, u=u), e.residual)
+    e, size = earth_mars, earth_mars.sizes()
+    judge = lambda u: judged(dataclasses.replace(e, u=u), size, e.residual)
     assert bool(judge(e.u) == jg.RESULTS.successful)
     assert bool(judge(e.u + jnp.pi) == jg.RESULTS.not_minimising)  # H maximised
 

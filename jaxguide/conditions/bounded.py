@@ -24,6 +24,33 @@ class BoundErrors(NamedTuple):
     complementarity: Float[Array, "node p_n_m"]
 
 
+def oversteps(
+    problem: Problem,
+    t: Float[Array, " node"],
+    x: Float[Array, "node n"],
+    u: Float[Array, "node m"],
+    size: Sizes,
+) -> tuple[Float[Array, "node p"], Float[Array, "node n"], Float[Array, "node m"]]:
+    """By how much path constraints, states and controls overstep their bounds, relative to their
+    sizes."""
+    path, state, control = (_over(*kind) for kind in _kinds(problem, t, x, u, size))
+    return path, state, control
+
+
+def _over(values: Float[Array, "node k"], bounds: Any, size: Array) -> Float[Array, "node k"]:
+    return overstep(values, bounds) / size[None]
+
+
+def _kinds(problem: Problem, t: Array, x: Array, u: Array, size: Sizes) -> Any:
+    """Values, bounds and sizes of path constraints, of states and of controls."""
+    h = jax.vmap(problem.path_constraints)(t, x, u)
+    return (
+        (h, problem.path_bounds, size.path),
+        (x, problem.state_bounds, size.x),
+        (u, problem.control_bounds, size.u),
+    )
+
+
 def bound_errors(
     problem: Problem,
     t: Float[Array, " node"],
@@ -33,13 +60,8 @@ def bound_errors(
     size: Sizes,
 ) -> BoundErrors:
     """`multipliers`: of path constraints, states and controls, (node, k) each."""
-    h = jax.vmap(problem.path_constraints)(t, x, u)
-    kinds: Any = (
-        (h, problem.path_bounds, size.path),
-        (x, problem.state_bounds, size.x),
-        (u, problem.control_bounds, size.u),
-    )
-    path, state, control = (overstep(values, within) / of[None] for values, within, of in kinds)
+    kinds = _kinds(problem, t, x, u, size)
+    path, state, control = (_over(*kind) for kind in kinds)
     slack = jax.vmap(slackness, in_axes=(0, 0, None, None))
     signs = [
         slack(by, values, within, of) * of[None]

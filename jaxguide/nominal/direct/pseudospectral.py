@@ -28,6 +28,7 @@ from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.direct.warm import blank_duals, duals, fits
 from jaxguide.nominal.guesses import is_key
 from jaxguide.nominal.method import Capabilities, Method
+from jaxguide.nominal.roots import differentiable_if
 from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
 from jaxguide.spectral import NodeFamily, node_family
 from jaxguide.trajectory import Extremal
@@ -308,7 +309,8 @@ def finished(
     whole = rewrapped(program.problem, problem)
     solution = _solved((whole, program.edges), program, start, options)
     program = _stated(program, (whole, program.edges))
-    return to_extremal(problem, program, limits_of(program), solution)
+    extremal = to_extremal(problem, program, limits_of(program), solution)
+    return differentiable_if(extremal.result == RESULTS.successful, extremal, problem)
 
 
 @eqx.filter_jit

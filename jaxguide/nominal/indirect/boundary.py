@@ -10,6 +10,7 @@ from jaxguide.bounds import bounds_of
 from jaxguide.conditions.canonical import optimal_hamiltonian
 from jaxguide.conditions.hamiltonian import endpoint_lagrangian
 from jaxguide.conditions.sizes import Sizes
+from jaxguide.linalg import power_of_two
 from jaxguide.problem import Problem, initial_values, initially_free, is_free
 
 
@@ -65,6 +66,18 @@ def unknown_sizes(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1
     nu = jnp.broadcast_to(jnp.max(jnp.abs(z.nu), initial=0.0), z.nu.shape)
     span = jnp.abs(tf - t0)
     return Unknowns(largest, nu, jnp.full_like(z.t0, span), jnp.full_like(z.tf, span))
+
+
+def unknown_units(problem: Problem, z: Unknowns) -> Unknowns:
+    """What Newton's steps are measured in, as powers of two, by which nothing is rounded: sizes;
+    but of a costate at least what the largest product of state and costate makes of it. One that
+    vanishes (of a state that nothing depends on) is rounding, which no step makes smaller."""
+    size, n = unknown_sizes(problem, z, z.starts), problem.n
+    x, costate = size.starts[:, :n], size.starts[:, n:]
+    worth = jnp.max(x * costate)
+    costate = jnp.maximum(costate, jnp.where(x > 0, worth / jnp.where(x > 0, x, 1.0), 0.0))
+    size = size._replace(starts=jnp.concatenate([x, costate], axis=1))
+    return jax.tree_util.tree_map(power_of_two, size)
 
 
 def boundary_sizes(problem: Problem, arcs: int, size: Sizes) -> Float[Array, " condition"]:

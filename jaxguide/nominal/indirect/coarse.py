@@ -14,6 +14,9 @@ from jaxguide.problem import Problem, is_free
 # Residual, relative to what a change of every unknown by its size would do to it, below which the
 # iteration ends, and below which it counts as converged: coarse steps are off by more than either.
 _SETTLED, CONVERGED = 1e-9, 1e-7
+# The same of a residual relative to the sizes at the start: of an unknown that vanishes at the
+# solution nothing but rounding is left, and its own size is that of the rounding.
+_ROUNDING = 1e-13
 _RISE = 2.0  # a residual may rise by this factor: Newton often climbs before it falls
 _SHORTER, _SHORTEST = 0.3, 1e-3  # of a refused step; where no step is left
 _ITERATIONS = 60
@@ -74,7 +77,8 @@ def damped_newton(problem: Problem, z: Unknowns, steps: int) -> tuple[Unknowns, 
         dv = jnp.where(better, -gauss_solve(jacobian, r), dv)
         step = jnp.where(better, 1.0, _SHORTER * step)
         best = jnp.where(better, largest, best)
-        left = jnp.where(better, relative, left)
+        reached = jnp.minimum(relative, largest * (_SETTLED / _ROUNDING))
+        left = jnp.where(better, reached, left)
         return v, dv, step, best, left, jnp.where(better, trial_cost, cost), unit, k + 1
 
     one = jnp.ones((), flat.dtype)

@@ -23,8 +23,9 @@ class Shooting(Method):
 
     Three stages, each in fixed shapes: damped Newton with coarse steps, from the guess or from
     `starts` random flights at once, the best converged one kept; an adaptive flight of it
-    (Diffrax's Dopri8 at `tolerance`), whose steps lay the mesh; and Newton (Optimistix) with
-    Dopri8 steps on that mesh, through which derivatives are implicit, forward and reverse.
+    (Diffrax's Dopri8 at `tolerance`), whose steps lay the mesh; and Newton with Dopri8
+    steps on that mesh, through which derivatives are implicit, forward and reverse: NaN where it
+    did not converge.
 
     **Arguments:**
 

@@ -8,20 +8,21 @@ from jaxtyping import Array, Float
 
 from jaxguide.bounds import overstep
 from jaxguide.conditions.angles import unwrap_angles
-from jaxguide.conditions.bounded import bound_errors
+from jaxguide.conditions.bounded import oversteps
 from jaxguide.conditions.canonical import canonical_rates
 from jaxguide.conditions.control import minimising_control
 from jaxguide.conditions.hamiltonian import hamiltonian
-from jaxguide.linalg import cholesky_positive, power_of_two
+from jaxguide.conditions.sizes import Sizes
+from jaxguide.linalg import cholesky_positive
 from jaxguide.nominal.indirect.boundary import (
     Unknowns,
     boundary_residual,
     boundary_sizes,
     horizon,
-    unknown_sizes,
+    unknown_units,
 )
 from jaxguide.nominal.indirect.coarse import objective
-from jaxguide.nominal.roots import implicit_root
+from jaxguide.nominal.roots import differentiable_if, implicit_root
 from jaxguide.nominal.steps import dopri8
 from jaxguide.problem import Problem, count, is_free
 from jaxguide.spectral import nodes_lgl
@@ -55,9 +56,7 @@ def shot(
     def residual(z: Unknowns, problem: Problem) -> Array:
         return boundary_residual(problem, z, fly(z, problem)[:, -1])
 
-    size = unknown_sizes(problem, z, z.starts)
-    unit = jax.tree_util.tree_map(power_of_two, size)
-    z = implicit_root(residual, z, problem, _STEP, _STEPS, unit)
+    z = implicit_root(residual, z, problem, _STEP, _STEPS, unknown_units(problem, z))
     return _extremal(problem, z, fractions, tau, fly(z, problem))
 
 
@@ -92,18 +91,20 @@ def _extremal(
         problem=problem,
     )
     still = jax.lax.stop_gradient(extremal)
-    worst = _worst(still, *jax.lax.stop_gradient((z, ends)))
-    return dataclasses.replace(extremal, residual=worst, result=judged(still, worst))
+    size = still.sizes()
+    worst = _worst(problem, size, *jax.lax.stop_gradient((z, ends)))
+    extremal = differentiable_if(worst <= _CONVERGED, extremal, problem)
+    return dataclasses.replace(extremal, residual=worst, result=judged(still, size, worst))
 
 
-def _worst(extremal: Extremal, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:
+def _worst(problem: Problem, size: Sizes, z: Unknowns, ends: Float[Array, "arc two_n_1"]) -> Array:
     """The largest error of a boundary condition, relative to its size."""
-    of = boundary_sizes(extremal.problem, ends.shape[0], extremal.sizes())
+    of = boundary_sizes(problem, ends.shape[0], size)
     of = jnp.where(jnp.isfinite(of), of, 1.0)
-    return jnp.max(jnp.abs(boundary_residual(extremal.problem, z, ends)) / of)
+    return jnp.max(jnp.abs(boundary_residual(problem, z, ends)) / of)
 
 
-def judged(extremal: Extremal, worst: Float[Array, ""]) -> RESULTS:
+def judged(extremal: Extremal, size: Sizes, worst: Float[Array, ""]) -> RESULTS:
     """Whether an extremal whose boundary conditions are missed by `worst`, relative to their sizes,
     converged, minimises H everywhere (Legendre-Clebsch), and keeps to its bounds."""
     problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
@@ -111,9 +112,7 @@ def judged(extremal: Extremal, worst: Float[Array, ""]) -> RESULTS:
         problem, t, x, u, extremal.costate
     )
     minimising = jnp.all(jax.vmap(cholesky_positive)(h_uu))
-    m = extremal.multipliers
-    over = bound_errors(problem, t, x, u, (m.path, m.state, m.control), extremal.sizes())
-    inside = [jnp.all(part <= _WITHIN) for part in (over.path, over.state, over.control)]
+    inside = [jnp.all(part <= _WITHIN) for part in oversteps(problem, t, x, u, size)]
     span = jnp.abs(t[-1] - t[0])
     for entry, time in ((problem.initial_time, t[0]), (problem.final_time, t[-1])):
         if is_free(entry):

@@ -20,8 +20,8 @@ _STEPS, _NEAR, _SEARCH = tuple(0.5**k for k in range(12)), 1e-2, 1e-9
 # Shifts of the Hessian, relative to its largest entry: the first, the factor to the next, and the
 # largest. Chosen, not tuned.
 _SHIFT, _GROW, _SHIFT_MAX = 1e-4, 10, 1e8
-# Residual and number of steps at which the root finder ends: rounding, and far more steps than
-# Newton's method takes from `_SEARCH`.
+# Last relative step and residual of the root finder, rounding; and the most steps it may take, far
+# more than Newton's method does from `_SEARCH`.
 _ROOT, _ROOT_STEPS = 1e-13, 12
 
 
@@ -146,4 +146,5 @@ def local_minimum(
 
 def polished(values: Values, z: KKTPoint, args: Any) -> KKTPoint:
     """`z` by Newton to rounding; differentiable in `args`, implicitly, forward and reverse."""
-    return implicit_root(lambda z, args: conditions(values, z, args), z, args, _ROOT, _ROOT_STEPS)
+    missed = lambda z, args: conditions(values, z, args)
+    return implicit_root(missed, z, args, _ROOT, _ROOT_STEPS, within=_ROOT)

@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.bounds import bounds_of, positive
-from jaxguide.conditions.bounded import bound_errors
+from jaxguide.conditions.bounded import oversteps
 from jaxguide.conditions.units import natural_units
 from jaxguide.nominal.ends import nearest_ends
 from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, local_minimum, polished, residual
 from jaxguide.nominal.parametric.extremal import parametric_extremal
+from jaxguide.nominal.roots import differentiable_if
 from jaxguide.nominal.starts import control_ends
 from jaxguide.problem import (
     Problem,
@@ -156,6 +157,7 @@ class PiecewiseLinear(Method):
             degree=self.degree,
             residual=error,
         )
+        extremal = differentiable_if(error <= _TOLERANCE, extremal, problem)
         result = RESULTS.where(minimal[best], RESULTS.successful, RESULTS.not_minimising)
         result = RESULTS.where(_within_bounds(extremal), result, RESULTS.bounds_violated)
         result = RESULTS.where(error <= _TOLERANCE, result, RESULTS.parameters_not_found)
@@ -242,9 +244,9 @@ def _starts(
 
 def _within_bounds(extremal: Extremal) -> Array:
     """Whether state and control keep within their bounds, which are not enforced."""
-    e, m = extremal, extremal.multipliers
-    over = bound_errors(e.problem, e.t, e.x, e.u, (m.path, m.state, m.control), e.sizes())
-    return jnp.all(over.state <= _WITHIN) & jnp.all(over.control <= _WITHIN)
+    e = extremal
+    _, state, control = oversteps(e.problem, e.t, e.x, e.u, e.sizes())
+    return jnp.all(state <= _WITHIN) & jnp.all(control <= _WITHIN)
 
 
 def _check_positions(positions: np.ndarray) -> None:
