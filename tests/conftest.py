@@ -31,6 +31,12 @@ import pytest  # noqa: E402
 import jaxguide as jg  # noqa: E402
 from jaxguide.problems.earth_mars import EarthMars  # noqa: E402
 
+
+def slow(*values):
+    """Parameters of a case that the default run leaves to the slow one."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 # Few starts, one coarse mesh: enough for problems whose extremal is unique and smooth.
 SMALL = jg.Shooting(arcs=2, segments=8, starts=4)
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator
+from conftest import DoubleIntegrator, slow
 
 import jaxguide as jg
 
@@ -32,7 +32,7 @@ class Meter:
         self.closed = True
 
 
-@pytest.mark.parametrize("count", [pytest.param(64, marks=pytest.mark.slow), 256])
+@pytest.mark.parametrize("count", [64, slow(256)])
 def test_lanes_are_single_solves(count):
     k = jnp.linspace(0.5, 2.0, count)
     meter = Meter()
@@ -45,7 +45,7 @@ def test_lanes_are_single_solves(count):
     np.testing.assert_array_equal(e.costate[3], one.costate)
 
 
-@pytest.mark.parametrize("count", [pytest.param(64, marks=pytest.mark.slow), 256])
+@pytest.mark.parametrize("count", [64, slow(256)])
 def test_vmap_under_jit_ends(count):
     # sequential_vmap: batched LAPACK has deadlocked at 64.
     k = jnp.linspace(0.5, 2.0, count)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime
+from conftest import DoubleIntegrator, FreeTime, slow
 
 import jaxguide as jg
 
@@ -125,7 +125,11 @@ def test_any_units(cap):
 
 @pytest.mark.parametrize(
     ("start", "end"),
-    [(0.0, jg.Free()), (jg.Free(0.0, 10.0), jg.Free(0.0, 10.0)), (jg.Free(), 5.0)],
+    [
+        slow(0.0, jg.Free()),
+        (jg.Free(0.0, 10.0), jg.Free(0.0, 10.0)),
+        slow(jg.Free(), 5.0),
+    ],
 )
 def test_horizons_stay_positive(start, end):
     """Unbounded ends once ran to t = -7, and two guesses of 5 made no horizon."""

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime
+from conftest import DoubleIntegrator, FreeTime, slow
 
 import jaxguide as jg
 from jaxguide.flight.actuators import LimitedCommand, PlainActuator
@@ -240,8 +240,9 @@ def concrete(contract):
 
 
 CASES = [(contract, c) for contract in CONTRACTS for c in concrete(contract)]
-# A solve with its batch and gradient compiles for half a minute.
-MARKED = [pytest.param(*c, marks=[pytest.mark.slow] if c[0] is jg.Method else []) for c in CASES]
+# A solve with its batch and gradient compiles for half a minute, Diffrax's flights for a quarter.
+LONG = (jg.Method, jg.Adaptive)
+MARKED = [slow(*c) if c[0] in LONG or c[1] in LONG else c for c in CASES]
 NAMES = [f"{a.__name__}-{b.__name__}" for a, b in CASES]
 each = pytest.mark.parametrize(("contract", "implementation"), CASES, ids=NAMES)
 each_marked = pytest.mark.parametrize(("contract", "implementation"), MARKED, ids=NAMES)

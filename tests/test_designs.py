@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow
 from jax.flatten_util import ravel_pytree
 
 from jaxguide import problems, tuning
@@ -50,8 +51,8 @@ def directional(ready, design, cases, temperature=None, width=1e-3):
 @pytest.mark.parametrize(
     ("name", "bound", "samples", "width"),
     [
-        ("earth-mars", 1e-5, 20.4, 3e-4),
-        pytest.param("earth-mars-history", 1e-6, 9.4, 1e-2, marks=pytest.mark.slow),
+        slow("earth-mars", 1e-5, 20.4, 3e-4),
+        slow("earth-mars-history", 1e-6, 9.4, 1e-2),
     ],
 )
 def test_gradient_of_earth_mars(name, bound, samples, width, earth_mars):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import at, flags, gain, history
+from conftest import at, flags, gain, history, slow
 
 import jaxguide as jg
 from jaxguide.problems.earth_mars import EarthMars
@@ -122,6 +122,7 @@ def re_solve(**changes):
     return jg.solve(dataclasses.replace(EarthMars(), **changes), jg.Shooting(starts=8))
 
 
+@pytest.mark.slow
 def test_history_against_re_solved_extremals(earth_mars, at_paper_times):
     """Central differences of re-solved flights over the whole horizon, its end included."""
     h = 1e-5
@@ -171,9 +172,7 @@ def truth(earth_mars):
     return times, jg.gain_schedule(earth_mars, times, segments=192, nodes=12, sweeps=16).K
 
 
-@pytest.mark.parametrize(
-    ("segments", "nodes"), [(16, 4), (32, 6), pytest.param(64, 4, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("segments", "nodes"), [slow(16, 4), (32, 6), slow(64, 4)])
 def test_the_error_estimate_is_honest(earth_mars, truth, segments, nodes):
     times, K = truth
     s = jg.gain_schedule(earth_mars, times, segments=segments, nodes=nodes)

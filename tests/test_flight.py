@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime, at
+from conftest import DoubleIntegrator, FreeTime, at, slow
 
 import jaxguide as jg
 from jaxguide.flight.simulate import prepare
@@ -293,7 +293,11 @@ def test_sensor_and_estimator(mission):
 # Integrators ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("hold", [jg.HoldDeviation(), jg.History()], ids=["held", "history"])
+@pytest.mark.parametrize(
+    "hold",
+    [jg.HoldDeviation(), slow(jg.History())],
+    ids=["held", "history"],
+)
 def test_fixed_steps_converge_at_fourth_order_to_adaptive(law, hold):
     fly = lambda integrator: np.asarray(
         simulate(

@@ -107,6 +107,7 @@ def regulated(regulator, times=None, **changes):
     return jg.gain_schedule(e, REGULATOR_PARTS * problem.final_time)
 
 
+@pytest.mark.slow
 def test_two_controls_against_closed_forms(regulator):
     a, q = np.array([0.5, -0.3]), np.array([2.0, 0.5])
     s = regulated(regulator, a=tuple(a), q=tuple(q))
@@ -189,6 +190,7 @@ class SmallUnits(DoubleIntegrator):
         return u[1:]
 
 
+@pytest.mark.slow
 def test_controls_of_any_size_between_nodes():
     """Nothing is small or large by its number alone: w stays on its constraint between nodes."""
     e = jg.solve(SmallUnits(), jg.Pseudospectral(nodes=4, segments=2, refinements=0))
@@ -208,6 +210,7 @@ def test_controls_of_any_size_between_nodes():
     np.testing.assert_allclose(u, exact(s), rtol=0, atol=1e-9 * CONTROL)
 
 
+@pytest.mark.slow
 def test_bounds_of_any_size_are_flagged(double_integrator):
     class Scaled(DoubleIntegrator):
         k: float = LENGTH / (TIME**2 * CONTROL)
@@ -269,6 +272,7 @@ def test_free_final_time_against_a_closed_form(free_time):
     np.testing.assert_allclose(s.dtf_dx[:3], np.stack([T_x, T_v], axis=1)[:3], rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_free_final_time_against_re_solved(free_time):
     s = jg.gain_schedule(free_time, 18**0.25 * np.linspace(0, 0.9, 6))
     h = 1e-4
@@ -328,6 +332,7 @@ class Crossing(jg.Problem):
         return xf[1:] - 0.4
 
 
+@pytest.mark.slow
 def test_zermelo_fixed_time_against_its_transition_matrix():
     e = jg.solve(Crossing(), jg.Shooting(arcs=2, segments=16, starts=16))
     times = np.array([0.0, 0.5, 1.0, 1.5, 1.9])

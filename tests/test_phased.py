@@ -112,6 +112,7 @@ def test_phases_that_do_not_join_are_refused():
         jax.grad(cost)(0.5)
 
 
+@pytest.mark.slow
 def test_phases_are_edited_where_they_are():
     phased = jg.Phased((First(), Second()))
     with pytest.raises(TypeError, match="control_bounds"):

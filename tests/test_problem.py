@@ -276,6 +276,7 @@ def test_properties_are_no_fields(hop):
     assert "final_time -2.0 is not after" in refusal(hop(half=-1.0))
 
 
+@pytest.mark.slow
 def test_a_problem_with_properties_is_solved_and_transformed(hop):
     solved = lambda p: jg.solve(p, SMALL, throw=False)
     e = jg.solve(dataclasses.replace(hop(), half=1.0), SMALL)

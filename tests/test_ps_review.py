@@ -42,6 +42,7 @@ def test_deterministic(report):
     assert [row.computed for row in again.rows] == [row.computed for row in report.rows]
 
 
+@pytest.mark.slow
 def test_figures(tmp_path):
     report = reproduce.get("ps-review").run(tmp_path)
     assert len({p.name for p in tmp_path.glob("*.png")}) == len(report.figures) == 7

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime
+from conftest import DoubleIntegrator, FreeTime, slow
 from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
@@ -134,7 +134,10 @@ def test_newton_step_against_dense_algebra(family, segments, points, knots):
     np.testing.assert_allclose(got, wanted, atol=1e-9 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize(("grid", "nodes", "segments"), [("lgl", 9, 1), ("lgr-right", 5, 3)])
+@pytest.mark.parametrize(
+    ("grid", "nodes", "segments"),
+    [slow("lgl", 9, 1), ("lgr-right", 5, 3)],
+)
 def test_double_integrator(grid, nodes, segments):
     e = jg.solve(DoubleIntegrator(), jg.Pseudospectral(grid, nodes, segments, refinements=0))
     t = np.asarray(e.t)
@@ -200,6 +203,7 @@ def test_earth_mars_against_shooting(earth_mars):
     np.testing.assert_allclose(slope, -3.5434202430, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_contradictory_ends_are_infeasible():
     class Torn(DoubleIntegrator):
         def endpoint_constraints(self, x0, xf, t0, tf):
@@ -307,6 +311,7 @@ def test_infinite_horizon():
     np.testing.assert_allclose(at.u, -(1 + np.sqrt(2)) * at.x, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_bounded_infinite_horizon():
     """u = -1.5 until x = 1.5/(1 + sqrt 2), then as above: rates that grow as 1/(1 - s)^2 towards
     the end must not set the objective's size (J was 4.8, and called a solution)."""
@@ -394,9 +399,7 @@ class HeldByPath(Held):
         return u[:1]
 
 
-@pytest.mark.parametrize(
-    ("problem", "over"), [(Held(), 0.0), pytest.param(HeldByPath(), 5e-6, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("problem", "over"), [(Held(), 0.0), slow(HeldByPath(), 5e-6)])
 def test_controls_between_nodes_keep_to_what_holds_them(problem, over):
     e = jg.solve(problem, jg.Pseudospectral(nodes=4, segments=2, refinements=0))
     u = np.asarray(e(jnp.array([0.1, 0.5, 0.93])).u)
@@ -408,6 +411,7 @@ def test_controls_between_nodes_keep_to_what_holds_them(problem, over):
         jg.linearize(e, jnp.array([0.1]))
 
 
+@pytest.mark.slow
 def test_failures_name_what_is_wrong():
     method = jg.Pseudospectral(nodes=4, segments=2)
     with pytest.raises(jg.SolveError, match=r"d\(v\)/dt is nan at node \d+ \(t = .*mend"):
@@ -419,6 +423,7 @@ def test_failures_name_what_is_wrong():
         jg.solve(DoubleIntegrator(), jg.Pseudospectral(nodes=500, segments=100_000))
 
 
+@pytest.mark.slow
 def test_discontinuous_dynamics_fail_the_certificate():
     class Torn(DoubleIntegrator):
         def dynamics(self, t, x, u):

@@ -24,6 +24,7 @@ def blocks(kind):
     return re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
 
 
+@pytest.mark.slow
 def test_example(tmp_path):
     (code,) = blocks("python")
     printed = run(code, tmp_path)

@@ -12,7 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SMALL, DoubleIntegrator, ForcedLQR, FreeTime, Regulator, at, zermelo_to_go
+from conftest import (
+    SMALL,
+    DoubleIntegrator,
+    ForcedLQR,
+    FreeTime,
+    Regulator,
+    at,
+    slow,
+    zermelo_to_go,
+)
 from scipy import integrate, optimize
 
 import jaxguide as jg
@@ -168,6 +177,7 @@ def test_a_conjugate_point_fails_its_row():
 # Single shooting and guesses ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_single_shooting_from_rough_costates(earth_mars):
     rough = jnp.round(earth_mars.costate[0], 1)
     e = jg.solve(EarthMars(), jg.Shooting(arcs=1), guess=rough)
@@ -398,6 +408,7 @@ def test_not_minimising_is_told_apart(earth_mars):
     assert bool(judge(e.u + jnp.pi) == jg.RESULTS.not_minimising)  # H maximised
 
 
+@pytest.mark.slow
 def test_violated_bounds_are_flagged(double_integrator):
     p = dataclasses.replace(DoubleIntegrator(), control_bounds=(-2.0, 2.0))
     with pytest.raises(jg.SolveError, match="bounds"):
@@ -459,7 +470,7 @@ def test_solve_refuses_a_bad_problem_at_once():
         jg.solve(FreeTime(final_time=0.0))
 
 
-@pytest.mark.parametrize("method", [SMALL, jg.PiecewiseLinear(3, starts=4)])
+@pytest.mark.parametrize("method", [SMALL, slow(jg.PiecewiseLinear(3, starts=4))])
 @pytest.mark.parametrize(("length", "time"), [(1e-9, 1.0), (1e-4, 1e-4), (1e7, 1e3), (1.0, 1e6)])
 def test_any_units_of_smooth_problems(method, length, time):
     """x'' = u over `length` in `time`: J = 6 length^2/time^3. Each program is compiled once."""

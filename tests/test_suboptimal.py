@@ -56,6 +56,7 @@ def test_minimiser_of_the_launch(launch):
     assert failing == {"H at the end", "Hamiltonian rate", "stationarity H_u"}
 
 
+@pytest.mark.slow
 def test_an_optimum_that_is_linear_is_found_exactly(integrator):
     t = np.asarray(integrator.t)
     np.testing.assert_allclose(integrator.u[:, 0], 6 - 12 * t, rtol=0, atol=1e-12)
@@ -157,6 +158,7 @@ def fly(loop, thrust, start):
     return jg.simulate(eqx.tree_at(where, loop, (plant, start)), None, "ends")
 
 
+@pytest.mark.slow
 def test_derivative_through_search_and_end(launch):
     """Of the end's time and state by the plant's thrust, against central differences."""
     loop = mission(launch)

@@ -141,6 +141,7 @@ def test_a_store_that_cannot_be_written(mission, tmp_path):
         flown(mission, store=tmp_path / "file" / "a")
 
 
+@pytest.mark.slow
 def test_an_unreachable_scheduler(mission):
     pytest.importorskip("distributed")
     with pytest.raises(ValueError, match="no Dask scheduler answers at 'tcp://127.0.0.1:9'"):

@@ -322,6 +322,7 @@ def test_flown_cases_are_those_of_a_sweep():
     np.testing.assert_allclose(missed, np.linalg.norm(off, axis=1), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_cases():
     """Reverse mode keeps a chunk's flights, and of each case its key and its miss."""
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import slow
 
 import jaxguide as jg
 
@@ -125,7 +126,11 @@ def test_sensor_and_gust_are_independent():
             assert abs(np.corrcoef(a, b)[0, 1]) < CORRELATION
 
 
-@pytest.mark.parametrize("integrator", [jg.RungeKutta4(), jg.Adaptive()], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize(
+    "integrator",
+    [jg.RungeKutta4(), slow(jg.Adaptive())],
+    ids=["fixed", "adaptive"],
+)
 def test_derivative_by_the_strength(integrator):
     """All that moves the vehicle is proportional to sigma."""
     mission = jg.Mission(
