@@ -32,7 +32,8 @@ class Meter:
         self.closed = True
 
 
-@pytest.mark.parametrize("count", [64, slow(256)])
+@pytest.mark.parametrize("count", [64, 256])
+@pytest.mark.slow
 def test_lanes_are_single_solves(count):
     k = jnp.linspace(0.5, 2.0, count)
     meter = Meter()

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime, slow
+from conftest import DoubleIntegrator, FreeTime
 
 import jaxguide as jg
 
@@ -109,6 +109,7 @@ def capped(length, time, cap):
 
 
 @pytest.mark.parametrize("cap", [5.0, np.inf])
+@pytest.mark.slow
 def test_any_units(cap):
     """A double integrator in lengths from 1e-9 to 1e7 and times from 1e-4 to 1e6, where v and u are
     known by neither bounds nor ends: all is what it is in units of one."""
@@ -126,11 +127,12 @@ def test_any_units(cap):
 @pytest.mark.parametrize(
     ("start", "end"),
     [
-        slow(0.0, jg.Free()),
+        (0.0, jg.Free()),
         (jg.Free(0.0, 10.0), jg.Free(0.0, 10.0)),
-        slow(jg.Free(), 5.0),
+        (jg.Free(), 5.0),
     ],
 )
+@pytest.mark.slow
 def test_horizons_stay_positive(start, end):
     """Unbounded ends once ran to t = -7, and two guesses of 5 made no horizon."""
     method = jg.Pseudospectral(nodes=6, segments=2, refinements=0)

@@ -326,6 +326,7 @@ def test_bounded_infinite_horizon():
     np.testing.assert_allclose(e.objective, squares + cap**2 * time + gain * end**2, rtol=5e-6)
 
 
+@pytest.mark.slow
 def test_relaxed_dynamics_cost_less():
     method = jg.Pseudospectral(nodes=5, segments=2, refinements=0, relaxation=1e-2)
     e = jg.solve(DoubleIntegrator(), method)
@@ -334,6 +335,7 @@ def test_relaxed_dynamics_cost_less():
     assert e.u.shape[1] == 1
 
 
+@pytest.mark.slow
 def test_what_cannot_be_fails_in_its_lane():
     """Bounds and horizons that `validate` cannot see under a trace."""
     method = jg.Pseudospectral(nodes=4, segments=2, refinements=0)
@@ -399,7 +401,8 @@ class HeldByPath(Held):
         return u[:1]
 
 
-@pytest.mark.parametrize(("problem", "over"), [(Held(), 0.0), slow(HeldByPath(), 5e-6)])
+@pytest.mark.parametrize(("problem", "over"), [(Held(), 0.0), (HeldByPath(), 5e-6)])
+@pytest.mark.slow
 def test_controls_between_nodes_keep_to_what_holds_them(problem, over):
     e = jg.solve(problem, jg.Pseudospectral(nodes=4, segments=2, refinements=0))
     u = np.asarray(e(jnp.array([0.1, 0.5, 0.93])).u)

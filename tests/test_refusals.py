@@ -100,7 +100,7 @@ class Ends(DoubleIntegrator):
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
-        (Root(), r"path_constraints is nan at node \d+ \(t = "),
+        slow(Root(), r"path_constraints is nan at node \d+ \(t = "),
         slow(Logarithm(), r"integrands is (nan|-inf) at node \d+"),
         (Cost(), r"endpoint_cost is nan at x0 = "),
         slow(Ends(), r"endpoint_constraints is nan at x0 = "),
@@ -118,6 +118,7 @@ def test_an_undefined_cost_is_no_success_of_shooting():
     assert e.result == jg.RESULTS.undefined
 
 
+@pytest.mark.slow
 def test_a_trace_reports_what_it_hides():
     """A mesh that should have been refined; an infinite end."""
 

@@ -103,6 +103,7 @@ def test_correlated_and_relative_quantiles():
     np.testing.assert_allclose(half, 1.5)
 
 
+@pytest.mark.slow
 def test_means_converge_faster_than_at_random():
     """A smooth function of four normals: E[exp(sum/4)] = e^(1/8), by 4,096 points, 8 seeds."""
     exact, count = np.exp(0.125), 4096

@@ -154,6 +154,7 @@ def test_a_nan_fails_its_rows(earth_mars):
     assert "state equation" in failed(spoiled.certificate)
 
 
+@pytest.mark.slow
 def test_the_costly_row_flies_the_control(earth_mars):
     whole = jg.certify(earth_mars, costly=True)
     assert "propagated state" in whole.names and bool(jnp.all(whole.passed))
@@ -388,6 +389,7 @@ def test_a_root_that_is_none_has_no_derivative():
     np.testing.assert_allclose(jax.vmap(root)(a[::3]), [2.0, 3.0], rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_a_failure_in_a_batch_spoils_only_its_own_gradient(earth_mars):
     def radius(thrust):
         e = jg.solve(EarthMars(thrust=thrust), SMALL, guess=earth_mars)

@@ -170,6 +170,7 @@ def test_derivative_through_search_and_end(launch):
     np.testing.assert_allclose(slope, fd, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_large_perturbations_are_flagged_and_finite(launch):
     loop = mission(launch)
     known = {k: getattr(jg.RESULTS, k) for k in ("missed", "end_not_reached", "no_reference_time")}
@@ -251,7 +252,7 @@ class Walled(DoubleIntegrator):
         return x[:1] - 2
 
 
-def test_refuses_problems(launch, integrator):
+def test_refuses_problems():
     with pytest.raises(ValueError, match="2 nodes make 2 parameters, fewer than the 3 endpoint"):
         jg.solve(Overdetermined(), jg.PiecewiseLinear(2))
     with pytest.raises(ValueError, match="path_constraints: 1 of them.*jg.Pseudospectral"):
@@ -260,6 +261,10 @@ def test_refuses_problems(launch, integrator):
         jg.solve(DoubleIntegrator(initial_state=(jg.Free(), 0.0)), NINE)
     with pytest.raises(ValueError, match="is an inequality"):
         jg.solve(DoubleIntegrator(endpoint_bounds=(0.0, 1.0)), NINE)
+
+
+@pytest.mark.slow
+def test_refuses_gains(launch, integrator):
     few = parametric_extremal(
         Placed(),
         np.linspace(0, 1, 5),

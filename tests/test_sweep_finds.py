@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, slow
+from conftest import DoubleIntegrator
 from test_montecarlo import Cliff, closed_loop
 from test_sweep_store import DISPERSIONS, TILE, assert_same, files, flown, mission, whole
 
@@ -30,7 +30,8 @@ STD = np.array([0.02, 0.01])
 # Evenly spread cases ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sampling", [slow("sobol"), "latin_hypercube"])
+@pytest.mark.parametrize("sampling", ["sobol", "latin_hypercube"])
+@pytest.mark.slow
 def test_evenly_spread_cases_are_the_same_anywhere(mission, sampling, tmp_path):
     """In chunks, alone, and in pure rollouts of the sweep's own keys."""
     once = flown(mission, sampling=sampling)
@@ -270,6 +271,7 @@ def test_a_full_disk(mission, tmp_path):
     assert_same(flown(mission, **options), resumed)
 
 
+@pytest.mark.slow
 def test_a_plant_without_endpoint_constraints():
     """A plant without endpoint constraints has no miss; its worst are the furthest off."""
 

@@ -166,6 +166,7 @@ def stations(design, temperature):
     return Table(PLACES, present), tuning.priced(present)
 
 
+@pytest.mark.slow
 def test_sample_count_against_all_integers():
     """More samples miss less and cost more: the count found is the best of all, or next to it."""
     of = objective(0.2)

@@ -85,6 +85,7 @@ def test_solves_with_a_certificate_and_gains():
     np.testing.assert_allclose(jg.gain_schedule(e, [0.5])(0.5), [[-24.0, -8.0]], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_under_jit_vmap_and_grad():
     # J = 6/k^2.
     np.testing.assert_allclose(jax.jit(cost)(2.0), 1.5, rtol=1e-12)
