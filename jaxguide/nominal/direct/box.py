@@ -6,9 +6,9 @@
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, traced_once, xp
 from jaxguide.nominal.direct.limits import Limits
 from jaxguide.nominal.direct.trees import total
 
@@ -37,18 +37,18 @@ class Box(NamedTuple):
     given: Entries
 
 
-@jax.jit
+@traced_once
 def boxed(limits: Limits) -> Box:
     """The box of `limits`, with a little room. An entry whose bounds coincide is given, unless it
     is a state: the defects determine those."""
     lo, hi = limits
-    room = lambda b: _RELAX * jnp.maximum(1.0, jnp.abs(b))
+    room = lambda b: _RELAX * xp.maximum(1.0, xp.abs(b))
     given = _tree(lambda a, b: a >= b, lo, hi)
-    given = given._replace(x=jnp.zeros_like(given.x))
-    lo = _tree(lambda a, g: jnp.where(g, a, a - room(a)), lo, given)
-    hi = _tree(lambda b, g: jnp.where(g, b, b + room(b)), hi, given)
-    below = _tree(lambda a, g: jnp.isfinite(a) & ~g, lo, given)
-    above = _tree(lambda b, g: jnp.isfinite(b) & ~g, hi, given)
+    given = given._replace(x=xp.zeros_like(given.x))
+    lo = _tree(lambda a, g: xp.where(g, a, a - room(a)), lo, given)
+    hi = _tree(lambda b, g: xp.where(g, b, b + room(b)), hi, given)
+    below = _tree(lambda a, g: xp.isfinite(a) & ~g, lo, given)
+    above = _tree(lambda b, g: xp.isfinite(b) & ~g, hi, given)
     return Box(lo, hi, below, above, given)
 
 
@@ -60,24 +60,20 @@ def inside(box: Box, w: Entries, push: Any) -> Entries:
     """
 
     def one(w: Array, lo: Array, hi: Array, below: Array, above: Array, given: Array) -> Array:
-        width = jnp.where(below & above, hi - lo, jnp.inf)
-        step = lambda b: jnp.minimum(push * jnp.maximum(1.0, jnp.abs(b)), push * width)
-        w = jnp.where(below, jnp.maximum(w, lo + step(jnp.where(below, lo, 0.0))), w)
-        w = jnp.where(above, jnp.minimum(w, hi - step(jnp.where(above, hi, 0.0))), w)
-        return jnp.where(given, lo, w)
+        width = xp.where(below & above, hi - lo, xp.inf)
+        step = lambda b: xp.minimum(push * xp.maximum(1.0, xp.abs(b)), push * width)
+        w = xp.where(below, xp.maximum(w, lo + step(xp.where(below, lo, 0.0))), w)
+        w = xp.where(above, xp.minimum(w, hi - step(xp.where(above, hi, 0.0))), w)
+        return xp.where(given, lo, w)
 
     return _tree(one, w, box.lo, box.hi, box.below, box.above, box.given)
 
 
-@jax.jit
+@traced_once
 def distances(box: Box, w: Entries) -> tuple[Entries, Entries]:
     """Distances of `w` to its lower and upper bounds; 1 where there is no bound."""
-    low = _tree(
-        lambda w, b, on: jnp.where(on, w - jnp.where(on, b, 0.0), 1.0), w, box.lo, box.below
-    )
-    high = _tree(
-        lambda w, b, on: jnp.where(on, jnp.where(on, b, 0.0) - w, 1.0), w, box.hi, box.above
-    )
+    low = _tree(lambda w, b, on: xp.where(on, w - xp.where(on, b, 0.0), 1.0), w, box.lo, box.below)
+    high = _tree(lambda w, b, on: xp.where(on, xp.where(on, b, 0.0) - w, 1.0), w, box.hi, box.above)
     return low, high
 
 
@@ -87,21 +83,21 @@ def complementarity(
     """Mean, over all bounds, of distance times multiplier; 0 if there is no bound."""
     both = _tree(lambda a, b, x, y: a * x + b * y, low, high, zl, zu)
     bounds = total(
-        _tree(lambda a, b: jnp.where(a, 1.0, 0.0) + jnp.where(b, 1.0, 0.0), box.below, box.above)
+        _tree(lambda a, b: xp.where(a, 1.0, 0.0) + xp.where(b, 1.0, 0.0), box.below, box.above)
     )
-    return total(both) / jnp.maximum(bounds, 1.0)
+    return total(both) / xp.maximum(bounds, 1.0)
 
 
-@jax.jit
+@traced_once
 def barrier_value(box: Box, w: Entries, mu: Float[Array, ""]) -> Float[Array, ""]:
     """-mu sum log(distance), with the linear damping of one-sided bounds.
 
     **Source:** Waechter & Biegler (2006), eq. (3) and section 3.7.
     """
     low, high = distances(box, w)
-    log = lambda a: jnp.log(jnp.where(a > 0, a, jnp.nan))
+    log = lambda a: xp.log(xp.where(a > 0, a, xp.nan))
     logs = total(_tree(lambda a, b: log(a) + log(b), low, high))
-    one = lambda a, b, l, h: _KAPPA_D * (jnp.where(l & ~h, a, 0.0) + jnp.where(h & ~l, b, 0.0))
+    one = lambda a, b, l, h: _KAPPA_D * (xp.where(l & ~h, a, 0.0) + xp.where(h & ~l, b, 0.0))
     return mu * (total(_tree(one, low, high, box.below, box.above)) - logs)
 
 
@@ -109,8 +105,8 @@ def barrier_gradient(box: Box, low: Entries, high: Entries, mu: Float[Array, ""]
     """Gradient of `barrier_value`, from the distances."""
 
     def one(a: Array, b: Array, l: Array, h: Array) -> Array:
-        lower = jnp.where(l, -1 / a + jnp.where(h, 0.0, _KAPPA_D), 0.0)
-        upper = jnp.where(h, 1 / b - jnp.where(l, 0.0, _KAPPA_D), 0.0)
+        lower = xp.where(l, -1 / a + xp.where(h, 0.0, _KAPPA_D), 0.0)
+        upper = xp.where(h, 1 / b - xp.where(l, 0.0, _KAPPA_D), 0.0)
         return mu * (lower + upper)
 
     return _tree(one, low, high, box.below, box.above)
@@ -125,12 +121,12 @@ def longest_step(
     """
 
     def one(a: Array, b: Array, d: Array, l: Array, h: Array) -> Array:
-        low = jnp.where(l & (d < 0), -tau * a / jnp.where(d < 0, d, -1.0), jnp.inf)
-        high = jnp.where(h & (d > 0), tau * b / jnp.where(d > 0, d, 1.0), jnp.inf)
-        return jnp.min(jnp.minimum(low, high), initial=1.0)
+        low = xp.where(l & (d < 0), -tau * a / xp.where(d < 0, d, -1.0), xp.inf)
+        high = xp.where(h & (d > 0), tau * b / xp.where(d > 0, d, 1.0), xp.inf)
+        return xp.min(xp.minimum(low, high), initial=1.0)
 
     steps = jax.tree_util.tree_leaves(_tree(one, gap_low, gap_high, dw, box.below, box.above))
-    return jnp.min(jnp.stack(steps))
+    return xp.min(xp.stack(steps))
 
 
 def longest_dual_step(z: Entries, dz: Entries, tau: Float[Array, ""]) -> Float[Array, ""]:
@@ -138,7 +134,7 @@ def longest_dual_step(z: Entries, dz: Entries, tau: Float[Array, ""]) -> Float[A
 
     **Source:** Waechter & Biegler (2006), eq. (15b).
     """
-    one = lambda z, d: jnp.min(
-        jnp.where(d < 0, -tau * z / jnp.where(d < 0, d, -1.0), jnp.inf), initial=1.0
+    one = lambda z, d: xp.min(
+        xp.where(d < 0, -tau * z / xp.where(d < 0, d, -1.0), xp.inf), initial=1.0
     )
-    return jnp.min(jnp.stack(jax.tree_util.tree_leaves(_tree(one, z, dz))))
+    return xp.min(xp.stack(jax.tree_util.tree_leaves(_tree(one, z, dz))))

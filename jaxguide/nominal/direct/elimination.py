@@ -8,10 +8,11 @@ transposed Jacobian.
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float, Int
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float, Int
 
+from jaxguide.arrays import Array, added, on_host, one_by_one, put, solve_triangular, xp
 from jaxguide.nominal.direct.newton_system import COMPLIANCE, NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 
@@ -47,7 +48,7 @@ def over_segments(f: Any, items: Any) -> Any:
     if jax.tree_util.tree_leaves(items)[0].shape[0] == 1:
         out = f(jax.tree_util.tree_map(lambda a: a[0], items))
         return jax.tree_util.tree_map(lambda a: a[None], out)
-    return jax.lax.map(f, items)
+    return one_by_one(f, items)
 
 
 def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
@@ -61,21 +62,21 @@ def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
     n, m, C, S = counts.n, counts.m, counts.nodes, counts.segments
     support = len(rule.support)
     # Entries that a barrier holds count for little, so that the reduced Hessian is well scaled.
-    flat = lambda x, u: jnp.concatenate([x.reshape(S, -1), u.reshape(S, -1)], axis=1)
-    weight = jnp.sqrt(1 + flat(system.sigma.x, _on_controls(system)))
-    A = jnp.asarray(rule.A, dtype)
-    diagonal = jnp.einsum("rp,ab->rapb", A, jnp.eye(n, dtype=dtype))  # of A X
+    flat = lambda x, u: xp.concatenate([x.reshape(S, -1), u.reshape(S, -1)], axis=1)
+    weight = xp.sqrt(1 + flat(system.sigma.x, _on_controls(system)))
+    A = xp.asarray(rule.A, dtype)
+    diagonal = xp.einsum("rp,ab->rapb", A, xp.eye(n, dtype=dtype))  # of A X
     one = lambda item: _null_space(program, diagonal, *item)
     basis, order, place, V = over_segments(one, (system.nodes.jacobian, weight))
 
     nv = V.shape[2]
     split = (support - 1) * n
     X, U = V[:, :split].reshape(S, support - 1, n, nv), V[:, split:].reshape(S, C, m, nv)
-    start = jnp.broadcast_to(jnp.eye(n, nv, dtype=dtype), (S, 1, n, nv))
-    x = jnp.concatenate([start, X], axis=1)[:, rule.first : rule.first + C]
+    start = xp.broadcast_to(xp.eye(n, nv, dtype=dtype), (S, 1, n, nv))
+    x = xp.concatenate([start, X], axis=1)[:, rule.first : rule.first + C]
     rest = system.nodes.jacobian.shape[3] - n - m
-    clock = jnp.broadcast_to(jnp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
-    T = jnp.concatenate([x, U, clock], axis=2)
+    clock = xp.broadcast_to(xp.eye(rest, nv, nv - rest, dtype=dtype), (S, C, rest, nv))
+    T = xp.concatenate([x, U, clock], axis=2)
     return Segments(basis, order, place, weight, X, U, T, *_quadratic(program, system, X, U, T))
 
 
@@ -85,27 +86,27 @@ def _null_space(
     """`basis`, `order` and `place` of one segment, see Segments, and (x, u) from v."""
     rule, n, m, C = program.rule, program.counts.n, program.counts.m, program.counts.nodes
     dtype = weight.dtype
-    B = jnp.asarray(rule.B, dtype)
+    B = xp.asarray(rule.B, dtype)
     own = slice(rule.first, rule.first + C)
     rows = rule.A.shape[0] * n
     # The defects' Jacobian by states, controls, clock and parameters: of A X - B F.
     F = jacobian[:, :n]
-    G = diagonal.at[:, :, own].add(-jnp.einsum("rk,kab->rakb", B, F[:, :, :n]))
-    to_u = -jnp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(rows, -1)
-    to_clock = -jnp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(rows, -1)
+    G = added(diagonal, np.s_[:, :, own], -xp.einsum("rk,kab->rakb", B, F[:, :, :n]))
+    to_u = -xp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(rows, -1)
+    to_clock = -xp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(rows, -1)
     start, G = G[:, :, 0].reshape(rows, n), G[:, :, 1:].reshape(rows, -1)
-    G = jnp.concatenate([G, to_u], axis=1) / weight[None]
+    G = xp.concatenate([G, to_u], axis=1) / weight[None]
 
     lu, order = _lu_with_order(G.T)
     basis = lu[:rows]
-    place = jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
+    place = put(xp.zeros_like(order), order, xp.arange(len(order), dtype=order.dtype))
     # Basic entries from the free ones, and from start, clock and parameters.
     free = -solve_triangular(basis, lu[rows:].T, trans=1, lower=True, unit_diagonal=True)
-    follow = -basic_entries(basis, jnp.concatenate([start, to_clock], axis=1))
-    one = jnp.eye(free.shape[1], dtype=dtype)
-    V = jnp.concatenate([
-        jnp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
-        jnp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
+    follow = -basic_entries(basis, xp.concatenate([start, to_clock], axis=1))
+    one = xp.eye(free.shape[1], dtype=dtype)
+    V = xp.concatenate([
+        xp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
+        xp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
     ])[place]  # fmt: skip
     return basis, order, place, V / weight[:, None]
 
@@ -117,23 +118,22 @@ def _quadratic(
     rule, n, inputs = program.rule, program.counts.n, T.shape[2]
     stiffness, _ = path_springs(system)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
-    W = system.node_hessian + jnp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
+    W = system.node_hessian + xp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
     W = W + on_diagonal(_on_controls(system), n, inputs)
     # Where every point after the first is a node, its barrier joins the node's own Hessian.
-    sigma = jnp.pad(system.sigma.x, ((0, 0), (1, 0), (0, 0)))
+    sigma = xp.pad(system.sigma.x, ((0, 0), (1, 0), (0, 0)))
     own = slice(rule.first, rule.first + program.points)
     if own.stop == sigma.shape[1]:
         H = gram(T, _times(W + on_diagonal(sigma[:, own], 0, inputs), T))
     else:
         H = gram(T, _times(W, T)) + gram(X, system.sigma.x[..., None] * X)
     if program.arcwise is not None:
-        of_columns = jax.vmap(program.roughness, in_axes=3, out_axes=3)
-        H = H + gram(U, of_columns(U))
+        H = H + gram(U, program.roughness(U))
     return W, H
 
 
 def _times(W: Array, T: Array) -> Array:
-    return jnp.einsum("skab,skbv->skav", W, T)
+    return xp.einsum("skab,skbv->skav", W, T)
 
 
 def gram(
@@ -141,7 +141,7 @@ def gram(
 ) -> Float[Array, "segment v v"]:
     """a^T b of every segment, summed over its points and their entries."""
     flat = lambda a: a.reshape(a.shape[0], -1, a.shape[3])
-    return jnp.einsum("siv,siw->svw", flat(a), flat(b))
+    return xp.einsum("siv,siw->svw", flat(a), flat(b))
 
 
 def on_diagonal(
@@ -150,8 +150,8 @@ def on_diagonal(
     """A diagonal matrix for each node, of all its `inputs`: `diagonal` from entry `first` on, zero
     elsewhere."""
     room = (first, inputs - first - diagonal.shape[2])
-    whole = jnp.pad(diagonal, ((0, 0), (0, 0), room))
-    return whole[..., None] * jnp.eye(inputs, dtype=diagonal.dtype)[None, None]
+    whole = xp.pad(diagonal, ((0, 0), (0, 0), room))
+    return whole[..., None] * xp.eye(inputs, dtype=diagonal.dtype)[None, None]
 
 
 def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
@@ -160,13 +160,23 @@ def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " r
     The order is read off a further column, which holds the rows' numbers: (L U)_last, rounded. XLA
     finds it from LAPACK's exchanges one by one, which took longer than the factorisation.
     """
+    if on_host(a):
+        return _lu_on_host(a)
     rows, columns = a.shape
-    numbers = jnp.arange(rows, dtype=a.dtype)[:, None]
-    lu = jax.lax.linalg.lu(jnp.concatenate([a, numbers], axis=1))[0]
+    numbers = xp.arange(rows, dtype=a.dtype)[:, None]
+    lu = jax.lax.linalg.lu(xp.concatenate([a, numbers], axis=1))[0]
     k = min(rows, columns + 1)
-    lower = jnp.tril(lu[:, :k], -1) + jnp.eye(rows, k, dtype=a.dtype)
-    order = jnp.round(lower @ lu[:k, columns])
-    return lu[:, :columns], jnp.clip(order, 0, rows - 1).astype(jnp.int32)
+    lower = xp.tril(lu[:, :k], -1) + xp.eye(rows, k, dtype=a.dtype)
+    order = xp.round(lower @ lu[:k, columns])
+    return lu[:, :columns], xp.clip(order, 0, rows - 1).astype(xp.int32)
+
+
+def _lu_on_host(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
+    lu, exchanges, _ = scipy.linalg.lapack.dgetrf(a)
+    order = np.arange(len(a), dtype=np.int32)
+    for k, other in enumerate(exchanges):
+        order[k], order[other] = order[other], order[k]
+    return lu, order
 
 
 def basic_entries(
@@ -179,7 +189,7 @@ def basic_entries(
 
 def _on_controls(system: NewtonSystem) -> Array:
     """Barrier curvature of the controls; given ones hardly move."""
-    return jnp.where(system.given.u, _STIFF, system.sigma.u)
+    return xp.where(system.given.u, _STIFF, system.sigma.u)
 
 
 def path_springs(
@@ -188,6 +198,6 @@ def path_springs(
     """Stiffness of the path constraints once their slacks are eliminated, and the share of a force
     on a slack that reaches the constraint."""
     sigma, fixed = system.sigma.path, system.given.path
-    flexible = jnp.where(fixed, 0.0, 1 / jnp.where(sigma > 0, sigma, 1.0))
-    stiffness = jnp.where((sigma > 0) | fixed, 1 / (flexible + COMPLIANCE), 0.0)
-    return stiffness, jnp.where(fixed, 0.0, 1 / (1 + COMPLIANCE * sigma))
+    flexible = xp.where(fixed, 0.0, 1 / xp.where(sigma > 0, sigma, 1.0))
+    stiffness = xp.where((sigma > 0) | fixed, 1 / (flexible + COMPLIANCE), 0.0)
+    return stiffness, xp.where(fixed, 0.0, 1 / (1 + COMPLIANCE * sigma))

@@ -12,11 +12,10 @@ additivity).
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Bool, Float
 
+from jaxguide.arrays import Array, added, cho_solve, cholesky, eigh, either, put, scan, xp
 from jaxguide.nominal.direct.elimination import Segments, gram, on_diagonal
 from jaxguide.nominal.direct.newton_system import NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
@@ -112,24 +111,24 @@ def factorise(
     right. `rho`: see Factor."""
     counts = program.counts
     n, W = counts.n, segments.W
-    everywhere = jnp.broadcast_to(delta, (*W.shape[:2], counts.m))
+    everywhere = xp.broadcast_to(delta, (*W.shape[:2], counts.m))
     W = W + on_diagonal(everywhere, n, W.shape[2])
     regular = lambda: (
         segments.H + delta * (gram(segments.X, segments.X) + gram(segments.U, segments.U))
     )
-    H = jax.lax.cond(delta > 0, regular, lambda: segments.H)
+    H = either(delta > 0, regular, lambda: segments.H)
     stages, P, convex = _sweep(program, segments, H, rho)
     K, held = _globals(program, system, P, delta)
-    equilibrium = jnp.sqrt(jnp.max(jnp.abs(K), axis=1) + _LEAST_SIZE)
+    equilibrium = xp.sqrt(xp.max(xp.abs(K), axis=1) + _LEAST_SIZE)
     scaled = K / equilibrium[:, None] / equilibrium[None, :]
-    finite = jnp.all(jnp.isfinite(scaled))
+    finite = xp.all(xp.isfinite(scaled))
     # Where the end is hardly within reach, or a constraint is redundant, its multiplier is soft;
     # refinement takes the softness out again.
-    soft = jnp.arange(len(held)) >= len(held) - n - counts.end
-    scaled = scaled - jnp.diag(jnp.where(soft, _SOFT, 0.0))
-    eye = jnp.eye(len(held), dtype=delta.dtype)
-    eigenvalues, vectors = jnp.linalg.eigh(jnp.where(finite, scaled, eye))
-    ok = convex & finite & (jnp.sum(eigenvalues < 0) == n + counts.end)
+    soft = xp.arange(len(held)) >= len(held) - n - counts.end
+    scaled = scaled - xp.diag(xp.where(soft, _SOFT, 0.0))
+    eye = xp.eye(len(held), dtype=delta.dtype)
+    eigenvalues, vectors = eigh(xp.where(finite, scaled, eye))
+    ok = convex & finite & (xp.sum(eigenvalues < 0) == n + counts.end)
     return Factor(W, delta, rho, stages, eigenvalues, vectors, equilibrium, scaled, held), ok
 
 
@@ -142,47 +141,49 @@ def _sweep(
     n, at = counts.n, sweep_layout(counts)
     nu = H.shape[1] - n - 2 - counts.parameters
     controls = slice(n, n + nu)
-    rest = jnp.concatenate([jnp.arange(n), jnp.arange(n + nu, H.shape[1])])  # of v: all but z
+    rest = np.concatenate([np.arange(n), np.arange(n + nu, H.shape[1])])  # of v: all but z
+    eye = np.eye(at.theta, dtype=dtype)
 
     def back(carry: tuple, item: tuple) -> tuple[tuple, SweepStage]:
         P, ok = carry
         X, H, L = item
         X_u, X_t = X[:, controls], X[:, rest] @ L
-        ahead = jnp.eye(at.theta, dtype=dtype).at[:n].set(X_t)  # theta after the segment
+        ahead = put(eye, np.s_[:n], X_t)  # theta after the segment
         R = H[controls, controls] + X_u.T @ P[:n, :n] @ X_u
         N = H[controls][:, rest] @ L + X_u.T @ (P[:n] @ ahead)
         Q = L.T @ H[rest][:, rest] @ L + ahead.T @ P @ ahead
-        factor = jnp.linalg.cholesky(R)
-        ok = ok & jnp.all(jnp.isfinite(factor))
-        KN = cho_solve((factor, True), N)
+        factor = cholesky(R)
+        ok = ok & xp.all(xp.isfinite(factor))
+        KN = cho_solve(factor, N)
         Q = Q - N.T @ KN
         return ((Q + Q.T) / 2, ok), SweepStage(factor, N, KN, X_u, X_t, L, P)
 
-    start = (_final_value(at, rho, n, dtype), jnp.array(True))
+    start = (_final_value(at, rho, n, dtype), xp.array(True))
     items = (segments.X[:, -1], H, _to_segments(program, at, dtype))
-    (P, ok), stages = jax.lax.scan(back, start, items, reverse=True)
+    (P, ok), stages = scan(back, start, items, reverse=True)
     return stages, P, ok
 
 
 def _final_value(at: SweepLayout, rho: Array, n: int, dtype: Any) -> Array:
     """Hessian of the value at the end, lambda_f^T (x - xf) + rho |x - xf|^2 / 2."""
     own, xf, lam = at.start, at.xf, at.lambda_f
-    eye = jnp.eye(n, dtype=dtype)
-    P = jnp.zeros((at.theta, at.theta), dtype)
-    P = P.at[own, own].set(rho * eye).at[xf, xf].set(rho * eye)
-    P = P.at[own, xf].set(-rho * eye).at[xf, own].set(-rho * eye)
-    P = P.at[own, lam].set(eye).at[lam, own].set(eye)
-    return P.at[xf, lam].set(-eye).at[lam, xf].set(-eye)
+    eye = xp.eye(n, dtype=dtype)
+    P = xp.zeros((at.theta, at.theta), dtype)
+    for a, b, value in ((own, own, rho * eye), (xf, xf, rho * eye), (own, xf, -rho * eye)):
+        P = put(put(P, np.s_[a, b], value), np.s_[b, a], value)
+    for a, value in ((own, eye), (xf, -eye)):
+        P = put(put(P, np.s_[a, lam], value), np.s_[lam, a], value)
+    return P
 
 
 def _to_segments(program: Transcription, at: SweepLayout, dtype: Any) -> Array:
     """(start, clock, parameters) of every segment from theta."""
     counts = program.counts
     n, np_ = counts.n, counts.parameters
-    L = jnp.zeros((counts.segments, n + 2 + np_, at.theta), dtype)
-    L = L.at[:, :n, at.start].set(jnp.eye(n, dtype=dtype))
-    L = L.at[:, n : n + 2, at.times].set(program.clocks)
-    return L.at[:, n + 2 :, at.p].set(jnp.eye(np_, dtype=dtype))
+    L = xp.zeros((counts.segments, n + 2 + np_, at.theta), dtype)
+    L = put(L, np.s_[:, :n, at.start], xp.eye(n, dtype=dtype))
+    L = put(L, np.s_[:, n : n + 2, at.times], program.clocks)
+    return put(L, np.s_[:, n + 2 :, at.p], xp.eye(np_, dtype=dtype))
 
 
 def _globals(
@@ -194,19 +195,19 @@ def _globals(
     n, q, dtype = counts.n, counts.end, P.dtype
     moving = sweep_layout(counts).moving
     nb = moving + n  # and xf
-    join = lambda w: jnp.concatenate([w.x0, w.times, w.p])
+    join = lambda w: xp.concatenate([w.x0, w.times, w.p])
     given = join(system.given)
     e_b = system.ends.jacobian[1:]
-    K = jnp.zeros((nb + n + q, nb + n + q), dtype).at[: nb + n, : nb + n].add(P)
-    K = K.at[:nb, :nb].add(system.end_hessian)
-    own = jnp.where(given, 0.0, join(system.sigma)) + delta  # of xf, a state, the segment has it
-    K = K.at[:moving, :moving].add(jnp.diag(own))
-    K = K.at[nb + n :, :nb].set(e_b).at[:nb, nb + n :].set(e_b.T)
-    K = K.at[nb + n :, nb + n :].set(-jnp.diag(flexibility(system)))
-    held = jnp.concatenate([given, jnp.zeros(nb + n + q - moving, bool)])
-    return jnp.where(held[:, None] | held[None, :], jnp.eye(len(held), dtype=dtype), K), held
+    K = put(xp.zeros((nb + n + q, nb + n + q), dtype), np.s_[: nb + n, : nb + n], P)
+    K = added(K, np.s_[:nb, :nb], system.end_hessian)
+    own = xp.where(given, 0.0, join(system.sigma)) + delta  # of xf, a state, the segment has it
+    K = added(K, np.s_[:moving, :moving], xp.diag(own))
+    K = put(put(K, np.s_[nb + n :, :nb], e_b), np.s_[:nb, nb + n :], e_b.T)
+    K = put(K, np.s_[nb + n :, nb + n :], -xp.diag(flexibility(system)))
+    held = xp.concatenate([given, xp.zeros(nb + n + q - moving, bool)])
+    return xp.where(held[:, None] | held[None, :], xp.eye(len(held), dtype=dtype), K), held
 
 
 def flexibility(system: NewtonSystem) -> Float[Array, " q"]:
     """1/Sigma of the endpoint slacks; 0 where they are given."""
-    return jnp.where(system.given.end, 0.0, 1 / jnp.maximum(system.sigma.end, _LEAST_CURVATURE))
+    return xp.where(system.given.end, 0.0, 1 / xp.maximum(system.sigma.end, _LEAST_CURVATURE))

@@ -8,10 +8,10 @@ the states and controls; last the multipliers of the defects, and the slacks.
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, added, cho_solve, loop, put, scan, solve_triangular, xp
 from jaxguide.nominal.direct.elimination import (
     Segments,
     basic_entries,
@@ -70,8 +70,8 @@ def newton_step(
 ) -> Step:
     """The solution for one right-hand side, refined where it needs to be: stiff barriers lose
     digits in the reduced Hessian, but not in the product with the matrix."""
-    add = lambda a, b: jax.tree_util.tree_map(jnp.add, a, b)
-    enough_force = _ENOUGH * jnp.maximum(1.0, largest(load.force))
+    add = lambda a, b: jax.tree_util.tree_map(xp.add, a, b)
+    enough_force = _ENOUGH * xp.maximum(1.0, largest(load.force))
     enough_residual = _ENOUGH_RESIDUAL * largest(load.residual) + _LEAST_RESIDUAL
 
     def refine(carry: tuple) -> tuple:
@@ -82,8 +82,8 @@ def newton_step(
         return count + 1, step, left, good
 
     blank = zeros_like(Step(load.force, load.residual))
-    return jax.lax.while_loop(
-        lambda a: ~a[3] & (a[0] <= _REFINEMENTS), refine, (0, blank, load, jnp.array(False))
+    return loop(
+        lambda a: ~a[3] & (a[0] <= _REFINEMENTS), refine, (0, blank, load, xp.array(False))
     )[1]
 
 
@@ -92,7 +92,7 @@ def eliminated_step(
 ) -> Step:
     """The solution for one right-hand side, by elimination alone."""
     force, residual = load
-    load = load._replace(force=force._replace(u=jnp.where(system.given.u, 0.0, force.u)))
+    load = load._replace(force=force._replace(u=xp.where(system.given.u, 0.0, force.u)))
     stiffness, share = path_springs(system)
     pushed = stiffness * residual.path + share * force.path
 
@@ -104,7 +104,7 @@ def eliminated_step(
     defect = _defect_multipliers(program, system, segments, factor, load, moved, pushed)
 
     # Path and endpoint slacks, from their equations.
-    h_dq = jnp.einsum("skha,ska->skh", system.nodes.jacobian[:, :, program.counts.n + 1 :], moved.q)
+    h_dq = xp.einsum("skha,ska->skh", system.nodes.jacobian[:, :, program.counts.n + 1 :], moved.q)
     path = stiffness * h_dq + pushed
     d_path = h_dq + residual.path - COMPLIANCE * path
     at = sweep_layout(program.counts)
@@ -112,11 +112,11 @@ def eliminated_step(
     primal = Primal(
         ends.theta[at.start],
         moved.x,
-        jnp.where(system.given.u, 0.0, moved.u),
+        xp.where(system.given.u, 0.0, moved.u),
         ends.theta[at.times],
         ends.parameters,
-        jnp.where(system.given.path, 0.0, d_path),
-        jnp.where(system.given.end, 0.0, d_end),
+        xp.where(system.given.path, 0.0, d_path),
+        xp.where(system.given.end, 0.0, d_end),
     )
     return Step(primal, Equations(defect, path, ends.nu))
 
@@ -132,15 +132,15 @@ def _particular(program: Transcription, segments: Segments, residual: Equations)
 
     def one(item: tuple) -> Array:
         basis, place, size, c = item
-        moved = jnp.zeros_like(size).at[: len(c)].set(-basic_entries(basis, c))
+        moved = put(xp.zeros_like(size), np.s_[: len(c)], -basic_entries(basis, c))
         return moved[place] / size
 
     items = (segments.basis, segments.place, segments.size, _by_segment(residual.defect))
     both = over_segments(one, items)
     x = both[:, : counts.after * n].reshape(S, -1, n)
     u = both[:, counts.after * n :].reshape(S, C, m)
-    at_nodes = jnp.pad(x, ((0, 0), (1, 0), (0, 0)))[:, rule.first : rule.first + C]
-    return _Particular(x, u, jnp.concatenate([at_nodes, u], axis=2))
+    at_nodes = xp.pad(x, ((0, 0), (1, 0), (0, 0)))[:, rule.first : rule.first + C]
+    return _Particular(x, u, xp.concatenate([at_nodes, u], axis=2))
 
 
 def _pull(
@@ -155,13 +155,13 @@ def _pull(
     """The forces on v that the load and the particular solution leave."""
     n, m = program.counts.n, program.counts.m
     force = load.force
-    f = jnp.einsum("skab,skb->ska", factor.W[..., : n + m], bar.q)
-    f = f.at[:, :, n : n + m].add(program.roughness(bar.u))
-    f = f + jnp.einsum("skha,skh->ska", system.nodes.jacobian[:, :, n + 1 :], pushed)
+    f = xp.einsum("skab,skb->ska", factor.W[..., : n + m], bar.q)
+    f = added(f, np.s_[:, :, n : n + m], program.roughness(bar.u))
+    f = f + xp.einsum("skha,skh->ska", system.nodes.jacobian[:, :, n + 1 :], pushed)
     on_states = force.x + (system.sigma.x + factor.delta) * bar.x
-    h = jnp.einsum("skav,ska->sv", segments.T, f)
-    h = h + jnp.einsum("sknv,skn->sv", segments.X, on_states)
-    return h + jnp.einsum("skmv,skm->sv", segments.U, force.u)
+    h = xp.einsum("skav,ska->sv", segments.T, f)
+    h = h + xp.einsum("sknv,skn->sv", segments.X, on_states)
+    return h + xp.einsum("skmv,skm->sv", segments.U, force.u)
 
 
 def _backward(factor: Factor, h: Float[Array, "segment v"], bar: _Particular) -> _Sweep:
@@ -172,14 +172,14 @@ def _backward(factor: Factor, h: Float[Array, "segment v"], bar: _Particular) ->
     def back(p: Array, item: tuple) -> tuple[Array, tuple]:
         s, h, x_end = item
         ahead = p + s.P[:, :n] @ x_end
-        rest = jnp.concatenate([h[:n], h[n + nu :]])
+        rest = xp.concatenate([h[:n], h[n + nu :]])
         h_u = h[n : n + nu] + s.X_u.T @ ahead[:n]
-        h_t = s.L.T @ rest + s.X_t.T @ ahead[:n] + ahead.at[:n].set(0.0)
-        k = cho_solve((s.factor, True), h_u)
+        h_t = s.L.T @ rest + s.X_t.T @ ahead[:n] + put(ahead, np.s_[:n], 0.0)
+        k = cho_solve(s.factor, h_u)
         return h_t - s.N.T @ k, (k, p)
 
-    zero = jnp.zeros(stages.P.shape[1], h.dtype)
-    p, (k, p_after) = jax.lax.scan(back, zero, (stages, h, bar.x[:, -1]), reverse=True)
+    zero = xp.zeros(stages.P.shape[1], h.dtype)
+    p, (k, p_after) = scan(back, zero, (stages, h, bar.x[:, -1]), reverse=True)
     return _Sweep(p, k, p_after)
 
 
@@ -189,11 +189,11 @@ def _global_step(
     """The global unknowns, by the eigenvectors of their matrix, refined once."""
     force, residual = load
     at = sweep_layout(program.counts)
-    own_force = jnp.concatenate([force.x0, force.times, force.p])
-    p = sweep.p.at[: at.moving].add(own_force)
-    pulled = jnp.where(system.given.end, 0.0, flexibility(system) * force.end)
-    rhs = -jnp.concatenate([p, residual.end + pulled])
-    rhs = jnp.where(factor.held, 0.0, rhs) / factor.equilibrium
+    own_force = xp.concatenate([force.x0, force.times, force.p])
+    p = added(sweep.p, np.s_[: at.moving], own_force)
+    pulled = xp.where(system.given.end, 0.0, flexibility(system) * force.end)
+    rhs = -xp.concatenate([p, residual.end + pulled])
+    rhs = xp.where(factor.held, 0.0, rhs) / factor.equilibrium
     invert = lambda r: factor.vectors @ ((factor.vectors.T @ r) / factor.eigenvalues)
     solution = invert(rhs)
     solution = (solution + invert(rhs - factor.K @ solution)) / factor.equilibrium
@@ -215,16 +215,16 @@ def _forward(
     def forward(theta: Array, item: tuple) -> tuple[Array, tuple]:
         s, X, x_end, k, p_after, clock = item
         z = -(s.KN @ theta + k)
-        v = jnp.concatenate([theta[at.start], z, clock @ theta[at.times], ends.parameters])
-        after = theta.at[at.start].set(X @ v + x_end)
+        v = xp.concatenate([theta[at.start], z, clock @ theta[at.times], ends.parameters])
+        after = put(theta, at.start, X @ v + x_end)
         return after, (v, s.P[:n] @ after + p_after[:n])
 
     by_segment = (sweep.k, sweep.p_after, program.clocks)
     items = (factor.stages, segments.X[:, -1], bar.x[:, -1], *by_segment)
-    _, (v, costate) = jax.lax.scan(forward, ends.theta, items)
-    dx = jnp.einsum("sknv,sv->skn", segments.X, v) + bar.x
-    du = jnp.einsum("skmv,sv->skm", segments.U, v) + bar.u
-    dq = jnp.einsum("skav,sv->ska", segments.T, v).at[:, :, : n + m].add(bar.q)
+    _, (v, costate) = scan(forward, ends.theta, items)
+    dx = xp.einsum("sknv,sv->skn", segments.X, v) + bar.x
+    du = xp.einsum("skmv,sv->skm", segments.U, v) + bar.u
+    dq = added(xp.einsum("skav,sv->ska", segments.T, v), np.s_[:, :, : n + m], bar.q)
     return _Forward(dx, du, dq, costate)
 
 
@@ -243,13 +243,14 @@ def _defect_multipliers(
     n, m, S, C = counts.n, counts.m, counts.segments, counts.nodes
     own = slice(rule.first, rule.first + C)
     h_xu = system.nodes.jacobian[:, :, n + 1 :][..., : n + m]
-    f = jnp.einsum("skab,skb->ska", factor.W[:, :, : n + m], moved.q)
-    f = f.at[:, :, n:].add(program.roughness(moved.u))
-    f = f + jnp.einsum("skha,skh->ska", h_xu, pushed)
-    on_states = jnp.zeros((S, counts.after + 1, n), f.dtype).at[:, own].set(f[..., :n])[:, 1:]
+    f = xp.einsum("skab,skb->ska", factor.W[:, :, : n + m], moved.q)
+    f = added(f, np.s_[:, :, n:], program.roughness(moved.u))
+    f = f + xp.einsum("skha,skh->ska", h_xu, pushed)
+    on_states = xp.zeros((S, counts.after + 1, n), f.dtype)
+    on_states = put(on_states, np.s_[:, own], f[..., :n])[:, 1:]
     on_states = on_states + load.force.x + (system.sigma.x + factor.delta) * moved.x
     # Forces that a next segment's nodes put on a shared end are in its own value.
-    on_states = on_states.at[:, -1].add(moved.costate)
+    on_states = added(on_states, np.s_[:, -1], moved.costate)
     on_controls = f[..., n:] + load.force.u
 
     def one(item: tuple) -> Array:
@@ -258,6 +259,6 @@ def _defect_multipliers(
         f = solve_triangular(basis, f, lower=True, unit_diagonal=True)
         return -solve_triangular(basis, f)
 
-    both = jnp.concatenate([_by_segment(on_states), _by_segment(on_controls)], axis=1)
+    both = xp.concatenate([_by_segment(on_states), _by_segment(on_controls)], axis=1)
     rows = over_segments(one, (segments.basis, segments.order, segments.size, both))
     return rows.reshape(S, -1, n)

@@ -13,9 +13,10 @@ factorised here: `kkt_factor` does that.
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, added, on_host, put, traced_once, xp
 from jaxguide.nominal.direct.transcription import Ends, Nodes, Transcription
 from jaxguide.nominal.direct.unknowns import Equations, Primal
 
@@ -63,24 +64,24 @@ def times_step(
     n = program.counts.n
     dw, y = step
     J, rule = system.nodes.jacobian, program.rule
-    A, B = (jnp.asarray(a, delta.dtype) for a in (rule.A, rule.B))
+    A, B = (xp.asarray(a, delta.dtype) for a in (rule.A, rule.B))
     dq, db = program.inputs(dw), program.end_inputs(dw)
     on_q, on_b, on_support = forces(program, system.nodes, system.ends, y, 0.0)
-    on_q = on_q + jnp.einsum("skab,skb->ska", system.node_hessian, dq)
+    on_q = on_q + xp.einsum("skab,skb->ska", system.node_hessian, dq)
     on_b = on_b + system.end_hessian @ db
     force = gather(program, dw, on_q, on_b, on_support)
     force = force._replace(u=force.u + program.roughness(dw.u))
-    springs = lambda f, s, d, g: jnp.where(g, 0.0, f + (s + delta) * d)
+    springs = lambda f, s, d, g: xp.where(g, 0.0, f + (s + delta) * d)
     own = jax.tree_util.tree_map(springs, force, system.sigma, dw, system.given)
-    slack = lambda y, s, d, g: jnp.where(g, 0.0, -y + s * d)
+    slack = lambda y, s, d, g: xp.where(g, 0.0, -y + s * d)
     force = own._replace(
         path=slack(y.path, system.sigma.path, dw.path, system.given.path),
         end=slack(y.end, system.sigma.end, dw.end, system.given.end),
     )
     e_b = system.ends.jacobian[1:]
-    defect = jnp.einsum("rp,spn->srn", A, program.support(dw))
-    defect = defect - jnp.einsum("rk,skna,ska->srn", B, J[:, :, :n], dq)
-    path = jnp.einsum("skha,ska->skh", J[:, :, n + 1 :], dq) - dw.path - COMPLIANCE * y.path
+    defect = xp.einsum("rp,spn->srn", A, program.support(dw))
+    defect = defect - xp.einsum("rk,skna,ska->srn", B, J[:, :, :n], dq)
+    path = xp.einsum("skha,ska->skh", J[:, :, n + 1 :], dq) - dw.path - COMPLIANCE * y.path
     return Load(force, Equations(defect, path, e_b @ db - dw.end))
 
 
@@ -90,17 +91,19 @@ def forces(
     """Derivatives of `cost` f + y^T c with respect to the nodes' inputs, the endpoint inputs and
     (of the defects' part A X alone) the states at the support points."""
     n = program.counts.n
-    weights = program.node_weights(y).at[:, :, n].set(cost)
-    on_q = jnp.einsum("sko,skoa->ska", weights, nodes.jacobian)
+    weights = put(program.node_weights(y), np.s_[:, :, n], cost)
+    on_q = xp.einsum("sko,skoa->ska", weights, nodes.jacobian)
     on_b = cost * ends.jacobian[0] + y.end @ ends.jacobian[1:]
-    A = jnp.asarray(program.rule.A, y.defect.dtype)
-    return on_q, on_b, jnp.einsum("rp,srn->spn", A, y.defect)
+    A = xp.asarray(program.rule.A, y.defect.dtype)
+    return on_q, on_b, xp.einsum("rp,srn->spn", A, y.defect)
 
 
 def gather(
     program: Transcription, like: Primal, on_q: Array, on_b: Array, on_support: Array
 ) -> Primal:
     """`forces` as derivatives with respect to the unknowns themselves, shaped `like` a Primal."""
+    if on_host(on_q):
+        return _gathered(program, like, on_q, on_b, on_support)
 
     def spread(w: Primal) -> tuple[Array, Array, Array]:
         return program.inputs(w), program.end_inputs(w), program.support(w)
@@ -108,7 +111,24 @@ def gather(
     return jax.linear_transpose(spread, like)((on_q, on_b, on_support))[0]
 
 
-@jax.jit
+def _gathered(
+    program: Transcription, like: Primal, on_q: Array, on_b: Array, on_support: Array
+) -> Primal:
+    """`gather` by hand: the transposes of `inputs`, `end_inputs` and `support`."""
+    rule, n, m = program.rule, program.counts.n, program.counts.m
+    clock, last = len(like.times), len(on_b) - n
+    on_x = added(on_support, np.s_[:, rule.first : rule.first + program.points], on_q[:, :, :n])
+    x = added(on_x[:, 1:], np.s_[:-1, -1], on_x[1:, 0])
+    x = added(x, np.s_[-1, -1], on_b[last:])
+    on_clock = np.sum(on_q[:, :, n + m : n + m + 2], axis=1)
+    times = np.einsum("sec,se->c", program.clocks, on_clock) + on_b[n : n + clock]
+    p = np.sum(on_q[:, :, n + m + 2 :], axis=(0, 1)) + on_b[n + clock : last]
+    none = lambda a: np.zeros_like(a)
+    u = on_q[:, :, n : n + m]
+    return Primal(on_x[0, 0] + on_b[:n], x, u, times, p, none(like.path), none(like.end))
+
+
+@traced_once
 def lagrangian_gradient(
     program: Transcription, nodes: Nodes, ends: Ends, w: Primal, y: Equations
 ) -> Primal:

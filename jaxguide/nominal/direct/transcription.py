@@ -12,12 +12,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, on_host, traced_once, xp
+from jaxguide.host.compilation import compiled
 from jaxguide.nominal.direct.collocation import Collocation, collocation
+from jaxguide.nominal.direct.points import (
+    Points,
+    clock_order,
+    derivatives,
+    hessian,
+    hessians,
+    values,
+)
 from jaxguide.nominal.direct.unknowns import Arcwise, Counts, Equations, Primal, Scale
-from jaxguide.problem import Problem, is_free, with_parameters
+from jaxguide.problem import Problem
 from jaxguide.spectral import NodeFamily, legendre_matrix
+
+_LADDER = 64  # least number of points that a program of the host evaluates; doubled until all fit
 
 
 class Nodes(NamedTuple):
@@ -79,7 +91,7 @@ class Transcription(eqx.Module):
     @property
     def clocks(self) -> Float[Array, "segment two clock"]:
         """The linear map from the times to (t_a, t_b), the end times of every segment."""
-        return jnp.stack([self.edges[:-1], self.edges[1:]], axis=1)
+        return xp.stack([self.edges[:-1], self.edges[1:]], axis=1)
 
     @property
     def dtype(self) -> Any:
@@ -107,76 +119,61 @@ class Transcription(eqx.Module):
             (*nodal, s.path), (s.end,),
         )  # fmt: skip
         cuts = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
-        parts = zip(jnp.split(vector, cuts), shapes, strict=True)
+        parts = zip(xp.split(vector, cuts), shapes, strict=True)
         return Primal(*(part.reshape(shape) for part, shape in parts))
 
     def starts(self, w: Primal) -> Float[Array, "segment n"]:
         """State at the start of every segment."""
-        return jnp.concatenate([w.x0[None], w.x[:-1, -1]])
+        return xp.concatenate([w.x0[None], w.x[:-1, -1]])
 
     def support(self, w: Primal) -> Float[Array, "segment support n"]:
         """States at all support points of every segment."""
-        return jnp.concatenate([self.starts(w)[:, None], w.x], axis=1)
+        return xp.concatenate([self.starts(w)[:, None], w.x], axis=1)
 
     def inputs(self, w: Primal) -> Float[Array, "segment node in"]:
         """(x, u, t_a, t_b, p) at every node."""
         rule, counts = self.rule, self.counts
         x = self.support(w)[:, rule.first : rule.first + self.points]
-        at = jnp.concatenate(
-            [self.clocks @ w.times, jnp.broadcast_to(w.p, (counts.segments, len(w.p)))], axis=1
+        at = xp.concatenate(
+            [self.clocks @ w.times, xp.broadcast_to(w.p, (counts.segments, len(w.p)))], axis=1
         )
-        at = jnp.broadcast_to(at[:, None], (counts.segments, self.points, at.shape[1]))
-        return jnp.concatenate([x, w.u, at], axis=2)
+        at = xp.broadcast_to(at[:, None], (counts.segments, self.points, at.shape[1]))
+        return xp.concatenate([x, w.u, at], axis=2)
 
-    def node(self, tau: Array, weight: Array, q: Float[Array, " in"]) -> Float[Array, " out"]:
-        """(dt/dtau f, w dt/dtau F, h) at one node, scaled; `q`: see `inputs`."""
-        n, m, scale = self.problem.n, self.problem.m, self.scale
-        x, u = q[:n] * scale.x, q[n : n + m] * scale.u
-        ta, tb = q[n + m] * scale.t, q[n + m + 1] * scale.t
-        problem = with_parameters(self.problem, q[n + m + 2 :] * scale.p)
-        t = (ta * (1 - tau) + tb * (1 + tau)) / 2  # review, eq. (5)
-        rate = (tb - ta) / 2
-        f = rate * problem.dynamics(t, x, u) / scale.x
-        cost = weight * rate * problem.running_cost(t, x, u) / scale.objective
-        return jnp.concatenate([f, cost[None], problem.path_constraints(t, x, u) / scale.path])
-
-    def end(self, b: Float[Array, " in"]) -> Float[Array, " out"]:
-        """(E, e), scaled, and the differences of times that must stay positive; `b`: see
-        `end_inputs`."""
-        n, scale = self.problem.n, self.scale
-        clock = self.edges.shape[1]
-        x0, times, p, xf = b[:n], b[n : n + clock], b[n + clock : -n], b[-n:]
-        problem = with_parameters(self.problem, p * scale.p)
-        at = (x0 * scale.x, xf * scale.x, times[0] * scale.t, times[1] * scale.t)
-        cost = problem.endpoint_cost(*at) / scale.objective
-        e = problem.endpoint_constraints(*at) / scale.end[: scale.end.shape[0] - len(self.order)]
-        return jnp.concatenate([cost[None], e, self.order @ times])
+    @property
+    def functions(self) -> Points:
+        """The Problem's functions at a point, scaled: they know nothing of the mesh."""
+        return Points(self.problem, self.scale, self.edges.shape[1])
 
     def end_inputs(self, w: Primal) -> Float[Array, " in"]:
         """(x0, times, p, xf)."""
-        return jnp.concatenate([w.x0, w.times, w.p, w.x[-1, -1]])
+        return xp.concatenate([w.x0, w.times, w.p, w.x[-1, -1]])
 
     @property
     def _nodes_and_weights(self) -> tuple[Array, Array]:
         rule, dtype = self.rule, self.dtype
-        return jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.w, dtype)
+        return xp.asarray(rule.nodes, dtype), xp.asarray(rule.w, dtype)
 
-    @jax.jit  # traced once a program, like those below
+    @traced_once  # like those below
     def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
         """`node` at every node, and `end`."""
-        over = jax.vmap(jax.vmap(self.node), in_axes=(None, None, 0))
-        return over(*self._nodes_and_weights, self.inputs(w)), self.end(self.end_inputs(w))
+        if on_host(w.x0):
+            return self._at_points(values, w)
+        over = jax.vmap(jax.vmap(self.functions.node), in_axes=(None, None, 0))
+        return over(*self._nodes_and_weights, self.inputs(w)), self.functions.end(
+            self.end_inputs(w)
+        )
 
-    def roughness(self, u: Float[Array, "segment node m"]) -> Float[Array, "segment node m"]:
+    def roughness(self, u: Float[Array, "segment node m *k"]) -> Float[Array, "segment node m *k"]:
         """Gradient, linear in u, of half the weighted squares of each control's upper Legendre
         coefficients. That term keeps a control smooth on a singular arc, where nothing else
         does."""
         if self.arcwise is None:
-            return jnp.zeros_like(u)
-        upper = legendre_matrix(jnp.asarray(self.rule.nodes, u.dtype))[self.points // 2 :]
-        return jnp.einsum("sm,ij,sjm->sim", self.arcwise.smooth, upper.T @ upper, u)
+            return xp.zeros_like(u)
+        upper = _legendre(self.rule.nodes)[self.points // 2 :]
+        return xp.einsum("sm,ij,sjm...->sim...", self.arcwise.smooth, upper.T @ upper, u)
 
-    @jax.jit
+    @traced_once
     def objective_and_residual(
         self, w: Primal, values: Any = None
     ) -> tuple[Float[Array, ""], Equations]:
@@ -190,31 +187,36 @@ class Transcription(eqx.Module):
         """
         node, end = self.values(w) if values is None else values
         n, rule, dtype = self.problem.n, self.rule, self.dtype
-        A, B = jnp.asarray(rule.A, dtype), jnp.asarray(rule.B, dtype)
+        A, B = xp.asarray(rule.A, dtype), xp.asarray(rule.B, dtype)
         # sum_j D_ij x_j - f(x_i, u_i) on [-1, 1]: review, eq. (21).
-        defect = jnp.einsum("rp,spn->srn", A, self.support(w))
-        defect = defect - jnp.einsum("rk,skn->srn", B, node[:, :, :n])
+        defect = xp.einsum("rp,spn->srn", A, self.support(w))
+        defect = defect - xp.einsum("rk,skn->srn", B, node[:, :, :n])
         residual = Equations(defect, node[:, :, n + 1 :] - w.path, end[1:] - w.end)
         # J^N = E + sum_i w_i F_i, the integral by quadrature: review, eqs (2), (15) and (21).
-        rough = jnp.sum(w.u * self.roughness(w.u)) / 2
-        return jnp.sum(node[:, :, n]) + end[0] + rough, residual
+        rough = xp.sum(w.u * self.roughness(w.u)) / 2
+        return xp.sum(node[:, :, n]) + end[0] + rough, residual
 
-    @jax.jit
+    @traced_once
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
         """Values and Jacobians, node by node and of the endpoint functions."""
+        if on_host(w.x0):
+            (value, jacobian), end = self._at_points(derivatives, w)
+            return Nodes(value, jacobian), Ends(*end)
         both = lambda f: lambda *a: (f(*a), f(*a))
-        node = jax.jacfwd(both(self.node), argnums=2, has_aux=True)
+        node = jax.jacfwd(both(self.functions.node), argnums=2, has_aux=True)
         over = jax.vmap(jax.vmap(node), in_axes=(None, None, 0))
         jacobian, value = over(*self._nodes_and_weights, self.inputs(w))
-        end_jacobian, end_value = jax.jacfwd(both(self.end), has_aux=True)(self.end_inputs(w))
+        end_jacobian, end_value = jax.jacfwd(both(self.functions.end), has_aux=True)(
+            self.end_inputs(w)
+        )
         return Nodes(value, jacobian), Ends(end_value, end_jacobian)
 
     def node_weights(self, y: Equations) -> Float[Array, "segment node out"]:
         """The factor of each entry of `Nodes.value` in the Lagrangian f + y^T c: -B^T y of the
         dynamics, 1 of the cost, y of the path constraints."""
-        B = jnp.asarray(self.rule.B, y.defect.dtype)
-        f = -jnp.einsum("rk,srn->skn", B, y.defect)
-        return jnp.concatenate([f, jnp.ones_like(f[:, :, :1]), y.path], axis=2)
+        B = xp.asarray(self.rule.B, y.defect.dtype)
+        f = -xp.einsum("rk,srn->skn", B, y.defect)
+        return xp.concatenate([f, xp.ones_like(f[:, :, :1]), y.path], axis=2)
 
     def hessians(
         self, w: Primal, y: Equations
@@ -222,31 +224,37 @@ class Transcription(eqx.Module):
         """Second derivatives of the Lagrangian f + y^T c: with respect to `inputs`, node by node,
         and, of its endpoint part, with respect to `end_inputs`."""
         weights = self.node_weights(y)
-        node = lambda tau, w, q, c: jnp.dot(c, self.node(tau, w, q))
+        c = xp.concatenate([xp.ones_like(y.end, shape=1), y.end])
+        if on_host(w.x0):
+            return self._at_points(hessians, w, weights, c)
+        node = lambda tau, w, q, c: jnp.dot(c, self.functions.node(tau, w, q))
         over = jax.vmap(jax.vmap(hessian(node, 2)), in_axes=(None, None, 0, 0))
         at_nodes = over(*self._nodes_and_weights, self.inputs(w), weights)
-        c = jnp.concatenate([jnp.ones_like(y.end, shape=1), y.end])
-        return at_nodes, hessian(lambda b: jnp.dot(c, self.end(b)), 0)(self.end_inputs(w))
+        return at_nodes, hessian(lambda b: jnp.dot(c, self.functions.end(b)), 0)(self.end_inputs(w))
+
+    def _at_points(self, program: Any, w: Primal, *weights: Any) -> Any:
+        """The results of `program` at every node and at the ends, on the host. Nodes are padded to
+        a ladder of sizes, so that few programs serve all meshes."""
+        q = self.inputs(w)
+        S, C = q.shape[:2]
+        size = _LADDER
+        while size < S * C:
+            size *= 2
+        padded = lambda a: np.concatenate(
+            [a, np.broadcast_to(a[-1:], (size - S * C, *a.shape[1:]))]
+        )
+        each = lambda a: padded(np.broadcast_to(a, (S, C)).reshape(-1))
+        flat = [padded(a.reshape(S * C, *a.shape[2:])) for a in (q, *weights[:1])]
+        points = (each(self.rule.nodes), each(self.rule.w), *flat)
+        ends = (self.end_inputs(w), *weights[1:])
+        nodes, end = jax.device_get(compiled(program, True)(self.functions, points, ends))
+        back = lambda a: a[: S * C].reshape(S, C, *a.shape[1:])
+        return jax.tree_util.tree_map(back, nodes), end
 
 
-def hessian(f: Any, argnum: int) -> Any:
-    """Second derivative of the scalar `f` by one argument, forward over reverse, symmetric to the
-    last bit."""
-    full = jax.jacfwd(jax.grad(f, argnums=argnum), argnums=argnum)
-
-    def symmetric(*args: Any) -> Array:
-        h = full(*args)
-        return (h + h.T) / 2
-
-    return symmetric
-
-
-def clock_order(problem: Problem, clocks: int) -> Float[np.ndarray, "row clock"]:
-    """The matrix from the times to their successive differences, which must stay above zero. It has
-    no rows unless knots or both ends are free: one free end is kept in order by its bounds."""
-    sequence = np.eye(clocks)[[0, *range(2, clocks), 1]]
-    free = is_free(problem.initial_time) and is_free(problem.final_time)
-    return np.diff(sequence, axis=0) if clocks > 2 or free else np.zeros((0, clocks))
+def _legendre(nodes: Float[np.ndarray, " node"]) -> Float[np.ndarray, "node node"]:
+    with jax.ensure_compile_time_eval():
+        return np.asarray(legendre_matrix(jnp.asarray(nodes)))
 
 
 def node_times(program: Transcription, w: Primal, at: np.ndarray) -> Float[Array, "segment k"]:

@@ -3,31 +3,32 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from jaxguide.arrays import Array, xp
 
 _tree = jax.tree_util.tree_map
 
 
 def total(tree: Any) -> Float[Array, ""]:
     """Sum of all entries; 0 if there are none."""
-    return sum((jnp.sum(a) for a in jax.tree_util.tree_leaves(tree)), jnp.zeros(()))
+    return sum((xp.sum(a) for a in jax.tree_util.tree_leaves(tree)), xp.zeros(()))
 
 
 def largest(tree: Any) -> Float[Array, ""]:
     """Largest absolute value of all entries; 0 if there are none."""
-    leaves = [jnp.max(jnp.abs(a), initial=0.0) for a in jax.tree_util.tree_leaves(tree)]
-    return jnp.max(jnp.stack(leaves))
+    leaves = [xp.max(xp.abs(a), initial=0.0) for a in jax.tree_util.tree_leaves(tree)]
+    return xp.max(xp.stack(leaves))
 
 
 def one_norm(tree: Any) -> Float[Array, ""]:
     """Sum of the absolute values of all entries."""
-    return total(_tree(jnp.abs, tree))
+    return total(_tree(xp.abs, tree))
 
 
 def all_finite(tree: Any) -> Bool[Array, ""]:
     """Whether every entry is finite."""
-    return jnp.isfinite(one_norm(tree))
+    return xp.isfinite(one_norm(tree))
 
 
 def entries(tree: Any) -> int:
@@ -37,7 +38,7 @@ def entries(tree: Any) -> int:
 
 def choose(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     """`yes` or `no`, two pytrees of one structure."""
-    return _tree(lambda a, b: jnp.where(condition, a, b), yes, no)
+    return _tree(lambda a, b: xp.where(condition, a, b), yes, no)
 
 
 def along(start: Any, length: Float[Array, ""], direction: Any) -> Any:
@@ -47,4 +48,4 @@ def along(start: Any, length: Float[Array, ""], direction: Any) -> Any:
 
 def zeros_like(tree: Any) -> Any:
     """A pytree of zeros."""
-    return _tree(jnp.zeros_like, tree)
+    return _tree(xp.zeros_like, tree)

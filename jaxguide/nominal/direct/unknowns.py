@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 
+from jaxguide.arrays import Array, xp
 from jaxguide.problem import Problem, count
 
 
@@ -30,7 +31,7 @@ class Primal(NamedTuple):
 
 def flattened(w: Primal) -> Shaped[Array, " unknown"]:
     """All entries as one vector; `Transcription.shaped` undoes it."""
-    return jnp.concatenate([a.reshape(-1) for a in w])
+    return xp.concatenate([a.reshape(-1) for a in w])
 
 
 class Equations(NamedTuple):

@@ -6,10 +6,9 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxguide.arrays import Array, loop, put, xp
 from jaxguide.nominal.direct.box import (
     complementarity,
     distances,
@@ -64,16 +63,16 @@ def barrier_of(setup: Setup, at: Iterate, delta: Float[Array, ""]) -> Barrier:
     s, newton, now = at.state, at.kind.newton, at.error_now
     gap = complementarity(setup.box, at.low, at.high, s.zl, s.zu)
     least = _least(setup.options)
-    falls = now <= _FALL * jnp.max(s.errors)
+    falls = now <= _FALL * xp.max(s.errors)
     free = newton & (delta == 0) & falls & (s.mu <= _NEAR)
-    errors = jnp.where(free, jnp.roll(s.errors, 1).at[0].set(now), s.errors)
-    held = jnp.where(newton & s.free & ~free, jnp.maximum(least, _HELD * gap), s.mu)
+    errors = xp.where(free, put(xp.roll(s.errors, 1), 0, now), s.errors)
+    held = xp.where(newton & s.free & ~free, xp.maximum(least, _HELD * gap), s.mu)
     # Waechter & Biegler (2006), eq. (7).
-    lower = lambda mu: jnp.maximum(least, jnp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
+    lower = lambda mu: xp.maximum(least, xp.minimum(_KAPPA_MU * mu, mu**_THETA_MU))
     solved = lambda mu: newton & ~free & (at.error(mu) <= _KAPPA_EPS * mu) & (mu > least)
-    mu = jax.lax.while_loop(solved, lower, held)
+    mu = loop(solved, lower, held)
     # Waechter & Biegler (2006), eq. (8); with a free barrier from the error, as in Ipopt.
-    tau = jnp.maximum(_TAU_MIN, 1 - jnp.where(free, now, mu))
+    tau = xp.maximum(_TAU_MIN, 1 - xp.where(free, now, mu))
     return Barrier(mu, free, tau, gap, errors)
 
 
@@ -83,16 +82,16 @@ def probed(setup: Setup, at: Iterate, barrier: Barrier, step: Move) -> Float[Arr
 
     **Source:** Nocedal, Waechter & Waltz (2009), Mehrotra's probing heuristic.
     """
-    s, box, gap, one = at.state, setup.box, barrier.gap, jnp.ones_like(at.state.mu)
-    dzl, dzu = bound_multiplier_step(setup, at, jnp.zeros_like(s.mu), step.primal)
+    s, box, gap, one = at.state, setup.box, barrier.gap, xp.ones_like(at.state.mu)
+    dzl, dzu = bound_multiplier_step(setup, at, xp.zeros_like(s.mu), step.primal)
     alpha = longest_step(at.low, at.high, step.primal, box, one)
-    alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, one), longest_dual_step(s.zu, dzu, one))
+    alpha_z = xp.minimum(longest_dual_step(s.zl, dzl, one), longest_dual_step(s.zu, dzu, one))
     low, high = distances(box, along(s.w, alpha, step.primal))
     zl, zu = along(s.zl, alpha_z, dzl), along(s.zu, alpha_z, dzu)
-    left = complementarity(box, low, high, zl, zu) / jnp.where(gap > 0, gap, 1.0)
+    left = complementarity(box, low, high, zl, zu) / xp.where(gap > 0, gap, 1.0)
     # It may not run ahead of the other conditions.
-    floor = jnp.minimum(s.mu, jnp.minimum(_AHEAD * at.error_now, at.error_now**_THETA_MU))
-    return jnp.clip(gap * left**_CENTRING, jnp.maximum(_least(setup.options), floor), _MU_MAX)
+    floor = xp.minimum(s.mu, xp.minimum(_AHEAD * at.error_now, at.error_now**_THETA_MU))
+    return xp.clip(gap * left**_CENTRING, xp.maximum(_least(setup.options), floor), _MU_MAX)
 
 
 def _least(options: Options) -> Array:

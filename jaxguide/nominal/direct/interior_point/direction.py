@@ -11,9 +11,10 @@ Three kinds of step share one matrix, so that the factorisation is compiled once
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Bool, Float
 
+from jaxguide.arrays import Array, added, loop, on_host, xp
 from jaxguide.nominal.direct.box import barrier_gradient
 from jaxguide.nominal.direct.elimination import Segments, eliminate
 from jaxguide.nominal.direct.interior_point.evaluation import Iterate
@@ -69,7 +70,7 @@ def gradients_of(setup: Setup, at: Iterate) -> Gradients:
     """The Gradients at an iterate."""
     program, w = setup.program, setup.program.shaped(at.state.w)
     of = lagrangian_gradient(program, at.nodes, at.ends, w, zeros_like(at.state.y))
-    pull = barrier_gradient(setup.box, at.low, at.high, jnp.ones_like(at.state.mu))
+    pull = barrier_gradient(setup.box, at.low, at.high, xp.ones_like(at.state.mu))
     return Gradients(flattened(of), pull)
 
 
@@ -84,10 +85,10 @@ def factorised(setup: Setup, at: Iterate) -> Matrix:
     system = NewtonSystem(at.nodes, at.ends, at_nodes, at_ends, sigma, given)
     segments = eliminate(program, system)
     rho = PENALTY * (1 + largest((at_nodes, at_ends)))
-    first = jnp.where(kind.estimate, 1.0, jnp.where(kind.restore, jnp.sqrt(s.mu), 0.0))
+    first = xp.where(kind.estimate, 1.0, xp.where(kind.restore, xp.sqrt(s.mu), 0.0))
     factorise_with = lambda delta: factorise(program, system, segments, delta, rho)
     delta, factor, regular = _corrected(factorise_with, first, s.delta)
-    needed = jnp.where(regular & ~kind.flat & (delta > 0), delta, s.delta)
+    needed = xp.where(regular & ~kind.flat & (delta > 0), delta, s.delta)
     return Matrix(system, segments, factor, delta, regular, needed)
 
 
@@ -97,10 +98,10 @@ def _sigma(setup: Setup, at: Iterate) -> Primal:
     program, s = setup.program, at.state
     w = program.shaped(s.w)
     on = {name: name in ("path", "end") for name in Primal._fields}
-    slacks = flattened(Primal(*(jnp.full_like(getattr(w, k), on[k]) for k in on)))
-    both = jnp.where(at.kind.estimate, slacks, s.zl / at.low + s.zu / at.high)
+    slacks = flattened(Primal(*(xp.full_like(getattr(w, k), on[k]) for k in on)))
+    both = xp.where(at.kind.estimate, slacks, s.zl / at.low + s.zu / at.high)
     sigma = program.shaped(both)
-    return sigma._replace(times=sigma.times.at[2:].add(_IDLE))
+    return sigma._replace(times=added(sigma.times, np.s_[2:], _IDLE))
 
 
 def _corrected(
@@ -112,24 +113,24 @@ def _corrected(
     def attempt(carry: tuple) -> tuple:
         delta, _, _ = carry
         factor, ok = factorise_with(delta)
-        again = jnp.where(last > 0, jnp.maximum(_DELTA_MIN, last / _FALL), _DELTA_FIRST)
-        grow = jnp.where(last > 0, _GROW, _GROW_FIRST)
-        following = jnp.where(delta > first, delta * grow, jnp.maximum(again, _GROW * delta))
-        return jnp.where(ok, delta, following), factor, ok
+        again = xp.where(last > 0, xp.maximum(_DELTA_MIN, last / _FALL), _DELTA_FIRST)
+        grow = xp.where(last > 0, _GROW, _GROW_FIRST)
+        following = xp.where(delta > first, delta * grow, xp.maximum(again, _GROW * delta))
+        return xp.where(ok, delta, following), factor, ok
 
-    blank = jax.eval_shape(lambda d: factorise_with(d)[0], first)
-    blank = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, a.dtype), blank)
-    return jax.lax.while_loop(
-        lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, jnp.array(False))
-    )
+    blank = None
+    if not on_host(first):
+        blank = jax.eval_shape(lambda d: factorise_with(d)[0], first)
+        blank = jax.tree_util.tree_map(lambda a: xp.zeros(a.shape, a.dtype), blank)
+    return loop(lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, xp.array(False)))
 
 
 def loaded(setup: Setup, at: Iterate, gradients: Gradients, c: Equations, mu: Array) -> Load:
     """The right-hand side of this kind of step, negated, for constraints `c` and barrier `mu`."""
     s, kind = at.state, at.kind
     bare = gradients.objective - s.zl + s.zu
-    with_barrier = jnp.where(kind.restore, 0.0, gradients.objective) + mu * gradients.barrier
-    force = setup.program.shaped(jnp.where(kind.estimate, bare, with_barrier))
+    with_barrier = xp.where(kind.restore, 0.0, gradients.objective) + mu * gradients.barrier
+    force = setup.program.shaped(xp.where(kind.estimate, bare, with_barrier))
     # The springs of path constraints start from the multipliers at hand.
     was = choose(kind.flat, zeros_like(s.y), s.y)
     return Load(force, c._replace(path=c.path + COMPLIANCE * was.path))
@@ -147,5 +148,5 @@ def bound_multiplier_step(setup: Setup, at: Iterate, mu: Array, d: Array) -> tup
     **Source:** Waechter & Biegler (2006), eq. (12).
     """
     s, box = at.state, setup.box
-    rate = lambda z, a, on, sign: jnp.where(on, mu / a - z - sign * z / a * d, 0.0)
+    rate = lambda z, a, on, sign: xp.where(on, mu / a - z - sign * z / a * d, 0.0)
     return rate(s.zl, at.low, box.below, 1.0), rate(s.zu, at.high, box.above, -1.0)

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.nominal.direct.box import Box, Entries, distances
 from jaxguide.nominal.direct.interior_point.state import Kind, Setup, State, kind_of
 from jaxguide.nominal.direct.newton_system import lagrangian_gradient
@@ -55,20 +55,20 @@ def optimality_error(
     **Source:** Waechter & Biegler (2006), eqs (4) and (5); s_d and s_c, after eq. (6).
     """
     net = _tree(lambda g, a, b: g - a + b, gradient, zl, zu)
-    net = _tree(lambda g, given: jnp.where(given, 0.0, g), net, box.given)
+    net = _tree(lambda g, given: xp.where(given, 0.0, g), net, box.given)
     low, high = distances(box, w)
     z = total(zl) + total(zu)
     multipliers = one_norm(y) + z
-    s_d = jnp.maximum(_S_MAX, multipliers / (entries(y) + 2 * entries(w))) / _S_MAX
-    s_d = jnp.minimum(s_d, _S_D_MAX)
-    s_c = jnp.maximum(_S_MAX, z / (2 * entries(w))) / _S_MAX
-    smooth = jnp.maximum(largest(net) / s_d, largest(c))
+    s_d = xp.maximum(_S_MAX, multipliers / (entries(y) + 2 * entries(w))) / _S_MAX
+    s_d = xp.minimum(s_d, _S_D_MAX)
+    s_c = xp.maximum(_S_MAX, z / (2 * entries(w))) / _S_MAX
+    smooth = xp.maximum(largest(net) / s_d, largest(c))
 
     def error(mu: Array) -> Array:
-        short = lambda a, z, on: jnp.where(on, a * z - mu, 0.0)
+        short = lambda a, z, on: xp.where(on, a * z - mu, 0.0)
         below = largest(_tree(short, low, zl, box.below))
         above = largest(_tree(short, high, zu, box.above))
-        return jnp.maximum(smooth, jnp.maximum(below, above) / s_c)
+        return xp.maximum(smooth, xp.maximum(below, above) / s_c)
 
     return error
 
@@ -82,5 +82,5 @@ def evaluated(setup: Setup, s: State) -> Iterate:
     gradient = flattened(lagrangian_gradient(program, nodes, ends, w, s.y))
     error = optimality_error(box, gradient, s.w, s.y, s.zl, s.zu, c)
     low, high = distances(box, s.w)
-    now = error(jnp.zeros_like(s.mu))
+    now = error(xp.zeros_like(s.mu))
     return Iterate(s, kind_of(s.mode), nodes, ends, f, c, low, high, error, now)

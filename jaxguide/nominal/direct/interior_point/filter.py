@@ -6,9 +6,9 @@ least as good as a trial point in both.
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxguide.arrays import Array, put, xp
 from jaxguide.nominal.direct.trees import choose
 
 # gamma_theta and gamma_phi, margins of sufficient progress: Waechter & Biegler (2006), eq. (18).
@@ -29,15 +29,15 @@ class Filter(NamedTuple):
 def empty_filter(dtype: Any) -> Filter:
     """A filter that forbids nothing. (The bound theta_max of Waechter & Biegler (2006), eq. (21),
     is held apart.)"""
-    slots = jnp.full(_SLOTS, -jnp.inf, dtype)
-    return Filter(slots, slots, jnp.zeros((), jnp.int32))
+    slots = xp.full(_SLOTS, -xp.inf, dtype)
+    return Filter(slots, slots, xp.zeros((), xp.int32))
 
 
 def acceptable(filter: Filter, theta: Float[Array, ""], phi: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether (theta, phi) lies outside the filter: better in one of the two than every corner."""
     better = (theta < filter.theta) | (phi < filter.phi)
-    live = jnp.arange(_SLOTS, dtype=filter.used.dtype) < filter.used
-    return jnp.all(better | ~live)
+    live = xp.arange(_SLOTS, dtype=filter.used.dtype) < filter.used
+    return xp.all(better | ~live)
 
 
 def augmented(
@@ -49,8 +49,8 @@ def augmented(
     """
     at = filter.used % _SLOTS
     new = Filter(
-        filter.theta.at[at].set((1 - GAMMA) * theta),
-        filter.phi.at[at].set(phi - GAMMA * theta),
+        put(filter.theta, at, (1 - GAMMA) * theta),
+        put(filter.phi, at, phi - GAMMA * theta),
         filter.used + 1,
     )
     return choose(add, new, filter)

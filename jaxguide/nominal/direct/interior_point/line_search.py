@@ -5,10 +5,9 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxguide.arrays import Array, loop, xp
 from jaxguide.nominal.direct.box import barrier_value, longest_step
 from jaxguide.nominal.direct.interior_point.barrier import Barrier, probed
 from jaxguide.nominal.direct.interior_point.direction import (
@@ -99,7 +98,7 @@ def searched(
     setup: Setup, at: Iterate, matrix: Matrix, gradients: Gradients, barrier: Barrier
 ) -> Found:
     """The step from an iterate, and how long it is."""
-    kind, one = at.kind, jnp.ones_like(barrier.mu)
+    kind, one = at.kind, xp.ones_like(barrier.mu)
     logs = barrier_value(setup.box, at.state.w, one)
     search = Search(setup, at, matrix, gradients, barrier, one_norm(at.c), logs)
     aim = _aimed(search)
@@ -114,7 +113,7 @@ def searched(
 
     # An estimate of the multipliers moves nothing, so that there is no length to look for.
     settled = aim.accepted | kind.estimate | ~regular
-    alpha, found, f_type, _ = jax.lax.while_loop(
+    alpha, found, f_type, _ = loop(
         lambda a: ~a[1] & (a[3] < _HALVINGS), shorten, (longest, settled, aim.f_type, 0)
     )
     accepted = regular & found & ~kind.estimate
@@ -134,29 +133,29 @@ def _aimed(search: Search) -> Aim:
 
     def aim(now: Aim) -> Aim:
         probe = now.count < 0
-        load = loaded(setup, at, gradients, now.target, jnp.where(probe, 0.0, now.mu))
+        load = loaded(setup, at, gradients, now.target, xp.where(probe, 0.0, now.mu))
         step = direction(setup, matrix, load)
         # Waechter & Biegler (2006), eq. (15a).
         inside = longest_step(at.low, at.high, step.primal, setup.box, barrier.tau)
-        length = jnp.minimum(inside, patient_length(setup.program, s.w, step.primal))
+        length = xp.minimum(inside, patient_length(setup.program, s.w, step.primal))
         first = choose(now.count == 0, (step, length), now.first)
         slope = _slope(search, now.mu, first[0].primal)
         trial = judged_trial(search, now.mu, first[1], slope, step.primal, length)
         ok = trial.ok & all_finite(step) & ~probe
         sound = probe & matrix.regular & all_finite(step)
-        mu = jnp.where(sound, probed(setup, at, barrier, step), now.mu)
-        worse = (trial.theta >= theta) & jnp.isfinite(trial.theta)
+        mu = xp.where(sound, probed(setup, at, barrier, step), now.mu)
+        worse = (trial.theta >= theta) & xp.isfinite(trial.theta)
         again = probe | ((now.count == 0) & kind.newton & matrix.regular & ~ok & worse)
         # c_soc = alpha c(x) + c(x + alpha d), Waechter & Biegler (2006), eq. (27).
         target = choose(probe, now.target, along(trial.c, length, at.c))
         return Aim(now.count + 1, mu, target, first, (step, length), ok, trial.f_type, again)
 
     target = choose(kind.estimate, zeros_like(at.c), at.c)
-    none = (Move(jnp.zeros_like(s.w), zeros_like(s.y)), jnp.ones_like(s.mu))
-    no, yes = jnp.array(False), jnp.array(True)
-    count = jnp.where(barrier.free, -1, 0)
+    none = (Move(xp.zeros_like(s.w), zeros_like(s.y)), xp.ones_like(s.mu))
+    no, yes = xp.array(False), xp.array(True)
+    count = xp.where(barrier.free, -1, 0)
     start = Aim(count, barrier.mu, target, none, none, no, no, yes)
-    return jax.lax.while_loop(lambda a: a.again, aim, start)
+    return loop(lambda a: a.again, aim, start)
 
 
 def judged_trial(
@@ -169,29 +168,29 @@ def judged_trial(
     """
     (program, box, _), at, theta, s = search.setup, search.at, search.theta, search.at.state
     phi = at.f + mu * search.logs
-    slack = _ROUNDINGS * jnp.finfo(phi.dtype).eps * (1 + jnp.abs(phi))
-    steep = jnp.where(slope < 0, -slope, 0.0)
+    slack = _ROUNDINGS * xp.finfo(phi.dtype).eps * (1 + xp.abs(phi))
+    steep = xp.where(slope < 0, -slope, 0.0)
     w = along(s.w, length, d)
     f, c = program.objective_and_residual(program.shaped(w))
     theta_new, phi_new = one_norm(c), f + barrier_value(box, w, mu)
-    sane = jnp.isfinite(theta_new) & jnp.isfinite(phi_new) & (theta_new <= s.theta_max)
+    sane = xp.isfinite(theta_new) & xp.isfinite(phi_new) & (theta_new <= s.theta_max)
     # Waechter & Biegler (2006): the switching condition, eq. (19); Armijo's, eq. (20); sufficient
     # progress, eq. (18).
     switch = alpha * steep**_S_PHI > _DELTA * theta**_S_THETA
     f_type = (slope < 0) & switch & (theta <= s.theta_min)
     armijo = phi_new <= phi + _ETA * alpha * slope + slack
     progress = (theta_new <= (1 - GAMMA) * theta) | (phi_new <= phi - GAMMA * theta + slack)
-    good = jnp.where(f_type, armijo, progress)
+    good = xp.where(f_type, armijo, progress)
     good = good & acceptable(filter_under(s, mu), theta_new, phi_new - slack)
     nearer = theta_new <= (1 - _NEARER * alpha) * theta
-    ok = sane & jnp.where(at.kind.restore, nearer, good)
+    ok = sane & xp.where(at.kind.restore, nearer, good)
     return Judgement(ok, f_type & armijo, c, theta_new)
 
 
 def filter_under(s: State, mu: Float[Array, ""]) -> Filter:
     """The filter for a barrier `mu`: empty if the barrier has changed, since points refused under
     another one say nothing of this one; Waechter & Biegler (2006), Algorithm A, step A-3."""
-    return s.filter._replace(used=jnp.where(mu != s.mu, 0, s.filter.used))
+    return s.filter._replace(used=xp.where(mu != s.mu, 0, s.filter.used))
 
 
 def patient_length(program: Transcription, w: Array, d: Array) -> Float[Array, ""]:
@@ -199,9 +198,9 @@ def patient_length(program: Transcription, w: Array, d: Array) -> Float[Array, "
     now, more = (program.shaped(a).times for a in (w, d))
     horizon, change = now[1] - now[0], more[1] - more[0]
     shrinks = (change < 0) & (horizon > 0)
-    return jnp.minimum(1.0, jnp.where(shrinks, -_SHRINK * horizon / change, 1.0))
+    return xp.minimum(1.0, xp.where(shrinks, -_SHRINK * horizon / change, 1.0))
 
 
 def _slope(search: Search, mu: Array, d: Array) -> Array:
     """Slope of the barrier function along `d`."""
-    return jnp.dot(search.gradients.objective + mu * search.gradients.barrier, d)
+    return xp.dot(search.gradients.objective + mu * search.gradients.barrier, d)

@@ -1,9 +1,10 @@
 """The iterations: one step after another, until the first-order conditions hold or none helps."""
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array
+import functools
 
+import jax
+
+from jaxguide.arrays import Array, either, loop, on_host, xp
 from jaxguide.nominal.direct.box import Box, boxed, distances, inside
 from jaxguide.nominal.direct.interior_point.barrier import MEMORY, barrier_of
 from jaxguide.nominal.direct.interior_point.direction import factorised, gradients_of
@@ -41,11 +42,11 @@ def minimise(program: Transcription, limits: Limits, start: Start, options: Opti
 
     **Source:** Waechter & Biegler (2006), Algorithm A.
     """
-    impossible = jnp.any(flattened(limits.lo) > flattened(limits.hi))
+    impossible = xp.any(flattened(limits.lo) > flattened(limits.hi))
     impossible = impossible | (limits.hi.times[1] <= limits.lo.times[0])
     setup = Setup(program, Box(*map(flattened, boxed(limits))), options)
     state = _first_state(setup, start, impossible)
-    end = jax.lax.while_loop(lambda s: s.status == RUNNING, lambda s: _advanced(setup, s), state)
+    end = loop(lambda s: s.status == RUNNING, lambda s: _advanced(setup, s), state)
     w, zl, zu = (program.shaped(a) for a in (end.w, end.zl, end.zu))
     _, c = program.objective_and_residual(w)
     return Solution(w, end.y, zl, zu, end.mu, end.status, end.iteration, end.error, largest(c))
@@ -56,13 +57,13 @@ def _first_state(setup: Setup, start: Start, impossible: Array) -> State:
     Waechter & Biegler (2006), section 3.6."""
     (program, box, options), dtype = setup, setup.program.dtype
     w, net = inside(box, flattened(start.w), options.push), flattened(start.net)
-    mu = jnp.asarray(options.mu, dtype)
+    mu = xp.asarray(options.mu, dtype)
     low, high = distances(box, w)
-    held = lambda a, z, on: jnp.where(on, jnp.maximum(mu / a, z), 0.0)
+    held = lambda a, z, on: xp.where(on, xp.maximum(mu / a, z), 0.0)
     zl, zu = held(low, -net, box.below), held(high, net, box.above)
     _, c = program.objective_and_residual(program.shaped(w))
     theta = one_norm(c)
-    zero, none = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
+    zero, none = xp.zeros((), dtype), xp.zeros((), xp.int32)
     return State(
         w=w,
         y=start.y,
@@ -70,16 +71,16 @@ def _first_state(setup: Setup, start: Start, impossible: Array) -> State:
         zu=zu,
         mu=mu,
         filter=empty_filter(dtype),
-        theta_max=_THETA_MAX * jnp.maximum(1.0, theta),
-        theta_min=_THETA_MIN * jnp.maximum(1.0, theta),
+        theta_max=_THETA_MAX * xp.maximum(1.0, theta),
+        theta_min=_THETA_MIN * xp.maximum(1.0, theta),
         theta_entry=theta,
         delta=zero,
-        mode=jnp.where(options.warm, NEWTON, ESTIMATE).astype(jnp.int32),
+        mode=xp.where(options.warm, NEWTON, ESTIMATE).astype(xp.int32),
         iteration=none,
-        status=jnp.where(impossible, none + INFEASIBLE, RUNNING),
-        error=zero + jnp.inf,
-        free=jnp.array(False),
-        errors=jnp.full(MEMORY, jnp.inf, dtype),
+        status=xp.where(impossible, none + INFEASIBLE, RUNNING),
+        error=zero + xp.inf,
+        free=xp.array(False),
+        errors=xp.full(MEMORY, xp.inf, dtype),
     )
 
 
@@ -89,13 +90,18 @@ def _advanced(setup: Setup, s: State) -> State:
     now = at.error_now
     done = at.kind.newton & (now <= setup.options.tolerance)  # Waechter & Biegler (2006), eq. (6)
     converged = s._replace(status=s.status * 0 + CONVERGED, iteration=s.iteration + 1, error=now)
-    none = jnp.zeros_like(s.mu)
+    none = xp.zeros_like(s.mu)
     stop, go_on = lambda: (converged, none, none), lambda: _step(setup, at)
-    new, delta, alpha = jax.lax.cond(done, stop, go_on)
+    new, delta, alpha = either(done, stop, go_on)
     program = setup.program
     if program.log:
         numbers = (s.iteration, at.f, largest(at.c), now, new.mu, delta, alpha)
-        jax.debug.callback(print_iteration, s.mode, program.scale.objective, *numbers)
+        show = (
+            print_iteration
+            if on_host(s.w)
+            else functools.partial(jax.debug.callback, print_iteration)
+        )
+        show(s.mode, program.scale.objective, *numbers)
     return new
 
 
@@ -106,4 +112,4 @@ def _step(setup: Setup, at: Iterate) -> tuple[State, Array, Array]:
     barrier = barrier_of(setup, at, matrix.delta)
     found = searched(setup, at, matrix, gradients, barrier)
     new = following(setup, at, matrix, barrier, found)
-    return new, matrix.delta, jnp.where(found.accepted, found.alpha, 0.0)
+    return new, matrix.delta, xp.where(found.accepted, found.alpha, 0.0)

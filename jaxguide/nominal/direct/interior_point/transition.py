@@ -3,9 +3,9 @@
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxguide.arrays import Array, either, xp
 from jaxguide.nominal.direct.box import barrier_value, distances, longest_dual_step
 from jaxguide.nominal.direct.interior_point.barrier import Barrier
 from jaxguide.nominal.direct.interior_point.direction import Matrix, bound_multiplier_step
@@ -65,8 +65,8 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
     s, kind, options = at.state, at.kind, setup.options
     point = _moved(setup, at, barrier, found)
     restoration = _restoration_after(setup, at, point, found)
-    mode = jnp.where((kind.restore & ~restoration.home) | restoration.into, RESTORE, NEWTON)
-    mode = jnp.where(restoration.home, ESTIMATE, mode)
+    mode = xp.where((kind.restore & ~restoration.home) | restoration.into, RESTORE, NEWTON)
+    mode = xp.where(restoration.home, ESTIMATE, mode)
     # A step that is not of f-type, and the point that restoration leaves, add a corner:
     # Waechter & Biegler (2006), eq. (22).
     add = (found.accepted & kind.newton & ~found.f_type) | restoration.into
@@ -80,7 +80,7 @@ def following(setup: Setup, at: Iterate, matrix: Matrix, barrier: Barrier, found
         filter=filter,
         theta_max=s.theta_max,
         theta_min=s.theta_min,
-        theta_entry=jnp.where(restoration.into, found.theta, s.theta_entry),
+        theta_entry=xp.where(restoration.into, found.theta, s.theta_entry),
         delta=matrix.needed,
         mode=mode.astype(s.mode.dtype),
         iteration=s.iteration + 1,
@@ -99,12 +99,12 @@ def _moved(setup: Setup, at: Iterate, barrier: Barrier, found: Found) -> Moved:
     s, kind, box, mu, d = at.state, at.kind, setup.box, found.mu, found.taken.primal
     dzl, dzu = bound_multiplier_step(setup, at, mu, d)
     tau = barrier.tau
-    alpha_z = jnp.minimum(longest_dual_step(s.zl, dzl, tau), longest_dual_step(s.zu, dzu, tau))
+    alpha_z = xp.minimum(longest_dual_step(s.zl, dzl, tau), longest_dual_step(s.zu, dzu, tau))
     w = along(s.w, found.alpha, d)
     low, high = distances(box, w)
     # Waechter & Biegler (2006), eq. (16).
-    keep = lambda z, a, on: jnp.where(
-        on, jnp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
+    keep = lambda z, a, on: xp.where(
+        on, xp.clip(z, mu / (_KAPPA_SIGMA * a), _KAPPA_SIGMA * mu / a), 0.0
     )
     zl = keep(along(s.zl, alpha_z, dzl), low, box.below)
     zu = keep(along(s.zu, alpha_z, dzu), high, box.above)
@@ -125,7 +125,7 @@ def _restoration_after(setup: Setup, at: Iterate, point: Moved, found: Found) ->
     (program, box, options), s, kind = setup, at.state, at.kind
     # Only restoration needs the new values: other steps save the evaluation.
     evaluate = lambda: program.objective_and_residual(program.shaped(point.w))
-    f, c = jax.lax.cond(kind.restore, evaluate, lambda: (at.f, at.c))
+    f, c = either(kind.restore, evaluate, lambda: (at.f, at.c))
     theta, phi = one_norm(c), f + barrier_value(box, point.w, found.mu)
     less = theta <= _KAPPA_RESTO * s.theta_entry
     home = (less & acceptable(found.filter, theta, phi)) | (
@@ -139,8 +139,8 @@ def _restoration_after(setup: Setup, at: Iterate, point: Moved, found: Found) ->
 
 def _status(options: Options, at: Iterate, restoration: Restoration) -> Int[Array, ""]:
     """Whether the iterations go on, or why not."""
-    feasible = largest(at.c) <= jnp.maximum(_LEAST_VIOLATION, options.tolerance)
-    status = jnp.where(restoration.stuck, jnp.where(feasible, STALLED, INFEASIBLE), RUNNING)
-    status = jnp.where(restoration.into & feasible, STALLED, status)
+    feasible = largest(at.c) <= xp.maximum(_LEAST_VIOLATION, options.tolerance)
+    status = xp.where(restoration.stuck, xp.where(feasible, STALLED, INFEASIBLE), RUNNING)
+    status = xp.where(restoration.into & feasible, STALLED, status)
     last = at.state.iteration + 1 >= options.max_iterations
-    return jnp.where(last & (status == RUNNING), TOO_MANY, status)
+    return xp.where(last & (status == RUNNING), TOO_MANY, status)

@@ -1,0 +1,154 @@
+"""One algebra on two engines: NumPy's where every array is NumPy's, JAX's otherwise.
+
+A first solve in a process would compile for seconds what it computes in hundredths of one. So the
+optimiser's algebra is written once, with `xp` in place of `jax.numpy`: under a trace it is JAX's
+and becomes one program, on the host it is NumPy's and SciPy's and compiles nothing.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+Array = jax.Array | np.ndarray | np.generic
+
+
+def on_host(*arrays: Any) -> bool:
+    """Whether none of them, or of what a list or tuple of them holds, is JAX's."""
+    for a in arrays:
+        if isinstance(a, jax.Array) or (isinstance(a, (list, tuple)) and not on_host(*a)):
+            return False
+    return True
+
+
+class _Engine:
+    """`xp.name(...)`: `numpy.name` or `jax.numpy.name`, by the arrays among the arguments."""
+
+    def __getattr__(self, name: str) -> Any:
+        mine, theirs = getattr(np, name), getattr(jnp, name)
+        if not callable(mine) or isinstance(mine, type):
+            setattr(self, name, mine)
+            return mine
+
+        @functools.wraps(mine)
+        def either(*args: Any, **options: Any) -> Any:
+            for a in args:
+                if isinstance(a, jax.Array):
+                    return theirs(*args, **options)
+                if isinstance(a, (list, tuple)) and not on_host(*a):
+                    return theirs(*args, **options)
+            return mine(*args, **options)
+
+        setattr(self, name, either)
+        return either
+
+
+xp: Any = _Engine()
+
+
+def put(a: Any, at: Any, values: Any) -> Any:
+    """`a` with `values` at the indices `at`."""
+    if on_host(a, values):
+        out = np.array(a)
+        out[at] = values
+        return out
+    return jnp.asarray(a).at[at].set(values)
+
+
+def added(a: Any, at: Any, values: Any) -> Any:
+    """`a` with `values` added at the indices `at`, each of which is named once."""
+    if on_host(a, values):
+        out = np.array(a)
+        out[at] += values
+        return out
+    return jnp.asarray(a).at[at].add(values)
+
+
+def loop(going: Callable, body: Callable, carry: Any) -> Any:
+    """`jax.lax.while_loop`."""
+    if not on_host(*jax.tree_util.tree_leaves(carry)):
+        return jax.lax.while_loop(going, body, carry)
+    while going(carry):
+        carry = body(carry)
+    return carry
+
+
+def either(condition: Any, yes: Callable, no: Callable) -> Any:
+    """`jax.lax.cond` of two functions without arguments."""
+    if isinstance(condition, jax.Array):
+        return jax.lax.cond(condition, yes, no)
+    return yes() if condition else no()
+
+
+def scan(step: Callable, carry: Any, items: Any, reverse: bool = False) -> tuple[Any, Any]:
+    """`jax.lax.scan`."""
+    leaves, structure = jax.tree_util.tree_flatten(items)
+    if not on_host(*leaves, *jax.tree_util.tree_leaves(carry)):
+        return jax.lax.scan(step, carry, items, reverse=reverse)
+    out: list[Any] = []
+    for k in range(len(leaves[0])):
+        at = -1 - k if reverse else k
+        carry, one = step(carry, structure.unflatten([a[at] for a in leaves]))
+        out.append(one)
+    return carry, stacked(out[::-1] if reverse else out)
+
+
+def stacked(trees: list[Any]) -> Any:
+    """One tree of the host's arrays from several, along a new leading axis."""
+    return jax.tree_util.tree_map(lambda *a: np.stack(a), *trees)
+
+
+def one_by_one(f: Callable, items: Any) -> Any:
+    """`jax.lax.map`."""
+    leaves, structure = jax.tree_util.tree_flatten(items)
+    if not on_host(*leaves):
+        return jax.lax.map(f, items)
+    return stacked([f(structure.unflatten([a[k] for a in leaves])) for k in range(len(leaves[0]))])
+
+
+def cholesky(a: Any) -> Any:
+    """The lower factor; NaN where `a` is not positive definite."""
+    if not on_host(a):
+        return jnp.linalg.cholesky(a)
+    factor, info = scipy.linalg.lapack.dpotrf(a, lower=1, clean=1)
+    return factor if info == 0 else np.full_like(a, np.nan)
+
+
+def cho_solve(factor: Any, b: Any) -> Any:
+    """A^-1 b from the lower Cholesky factor of A."""
+    if not on_host(factor, b):
+        return jax.scipy.linalg.cho_solve((factor, True), b)
+    return scipy.linalg.lapack.dpotrs(factor, b, lower=1)[0]
+
+
+def solve_triangular(a: Any, b: Any, **options: Any) -> Any:
+    """`jax.scipy.linalg.solve_triangular`, which does not look for NaN."""
+    if not on_host(a, b):
+        return jax.scipy.linalg.solve_triangular(a, b, **options)
+    return scipy.linalg.solve_triangular(a, b, check_finite=False, **options)
+
+
+def eigh(a: Any) -> Any:
+    """Eigenvalues and vectors; NaN where there are none."""
+    if not on_host(a):
+        return jnp.linalg.eigh(a)
+    try:
+        return tuple(np.linalg.eigh(a))
+    except np.linalg.LinAlgError:
+        return np.full(a.shape[0], np.nan), np.full_like(a, np.nan)
+
+
+def traced_once(function: Callable) -> Callable:
+    """`jax.jit` of `function` where its arguments are JAX's; itself where they are the host's."""
+    program = jax.jit(function)
+
+    @functools.wraps(function)
+    def called(*args: Any) -> Any:
+        host = on_host(*jax.tree_util.tree_leaves(args[1:] or args))
+        return function(*args) if host else program(*args)
+
+    return called
