@@ -125,11 +125,18 @@ def cho_solve(factor: Any, b: Any) -> Any:
     return scipy.linalg.lapack.dpotrs(factor, b, lower=1)[0]
 
 
-def solve_triangular(a: Any, b: Any, **options: Any) -> Any:
-    """`jax.scipy.linalg.solve_triangular`, which does not look for NaN."""
+def solve_triangular(
+    a: Any, b: Any, trans: int = 0, lower: bool = False, unit_diagonal: bool = False
+) -> Any:
+    """`jax.scipy.linalg.solve_triangular`."""
     if not on_host(a, b):
-        return jax.scipy.linalg.solve_triangular(a, b, **options)
-    return scipy.linalg.solve_triangular(a, b, check_finite=False, **options)
+        return jax.scipy.linalg.solve_triangular(
+            a, b, trans=trans, lower=lower, unit_diagonal=unit_diagonal
+        )
+    if not b.size:
+        return b
+    x, info = scipy.linalg.lapack.dtrtrs(a, b, lower, trans, unit_diagonal)
+    return x if info == 0 else np.full_like(x, np.nan)
 
 
 def eigh(a: Any) -> Any:

@@ -48,16 +48,23 @@ def grid(family: str | NodeFamily, n: int) -> Grid:
     weights = capacity_weights(x)
     d = differentiation(x, weights)
 
-    points, gauss = nodes_lg(n)
     k = np.arange(n)
-    legendre = (k[:, None] + 0.5) * np.polynomial.legendre.legvander(points, n - 1).T * gauss
     p = np.polynomial.legendre.legvander(x, n) - (-1.0) ** np.arange(n + 1)
     lower = np.concatenate([np.zeros((n, 1)), p[:, : n - 1]], axis=1)
-    b = (p[:, 1:] - lower) / (2 * k + 1) @ legendre @ evaluation(x, points, weights)
+    b = (p[:, 1:] - lower) / (2 * k + 1) @ legendre(x, weights)
     out = Grid(x, w, d, b, evaluation(x, np.array([-1.0, 1.0]), weights))
     for a in out:
         a.flags.writeable = False
     return out
+
+
+def legendre(x: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """From values at the nodes `x` to the Legendre coefficients of their interpolant; see
+    `legendre_matrix`."""
+    points, gauss = nodes_lg(len(x))
+    k = np.arange(len(x))
+    project = (k[:, None] + 0.5) * np.polynomial.legendre.legvander(points, len(x) - 1).T * gauss
+    return project @ evaluation(x, points, weights)
 
 
 def capacity_weights(x: np.ndarray) -> np.ndarray:

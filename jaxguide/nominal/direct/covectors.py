@@ -3,22 +3,25 @@
 **Source:** Ross & Karpenko, review (2012), section 4.1: eqs (23)-(24), Proposition 1, Remark 3.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxguide.arrays import Array, added, on_host, put, xp
 from jaxguide.conditions.angles import unwrap_angles
+from jaxguide.host.compilation import compiled
 from jaxguide.nominal.direct import interior_point
 from jaxguide.nominal.direct.box import Box, boxed, distances
 from jaxguide.nominal.direct.collocation import left_null
 from jaxguide.nominal.direct.limits import Limits
 from jaxguide.nominal.direct.newton_system import lagrangian_gradient
+from jaxguide.nominal.direct.points import padded_to_ladder
 from jaxguide.nominal.direct.transcription import Nodes, Transcription, node_times
 from jaxguide.nominal.direct.unknowns import flattened
 from jaxguide.problem import Problem, choices, is_free, with_parameters
-from jaxguide.spectral import interpolation_matrix
+from jaxguide.spectral.grids import evaluation
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.types import RESULTS
 
@@ -49,12 +52,12 @@ def to_extremal(
     x = whole(program.support(w))[:, :n] * scale.x[None, :n]
     to_user = (scale.objective / scale.x)[None, :n]
     f, _ = program.objective_and_residual(w)
-    residual = jnp.maximum(solution.error, solution.violation)
+    residual = xp.maximum(solution.error, solution.violation)
     return Extremal(
         t=_times(program, solution),
         x=x,
         u=(whole(u) * scale.u[None])[:, :m],
-        reference_nodes=jnp.asarray(rule.support, program.dtype),
+        reference_nodes=xp.asarray(rule.support, program.dtype),
         u_before=(u[:, -1] * scale.u[None])[:, :m],
         costate=whole(covectors.at_support)[:, :n] * to_user,
         costate_before=covectors.before[:, :n] * to_user,
@@ -72,19 +75,19 @@ def to_extremal(
 def whole(a: Float[Array, "segment support *k"]) -> Float[Array, "point *k"]:
     """Values at the support points as one sequence: a point that two segments share is the first of
     the later one."""
-    return jnp.concatenate([jnp.concatenate(a[:, :-1]), a[-1, -1:]])
+    return xp.concatenate([xp.concatenate(a[:, :-1]), a[-1, -1:]])
 
 
 def _times(program: Transcription, solution: interior_point.Solution) -> Float[Array, " point"]:
     """Times of the support points, in user units."""
     t = node_times(program, solution.w, program.rule.support)
-    return jnp.concatenate([t[:, :-1].reshape(-1), t[-1, -1:]])
+    return xp.concatenate([t[:, :-1].reshape(-1), t[-1, -1:]])
 
 
 def _spread(program: Transcription) -> Float[Array, "support node"]:
     """From values at the nodes to the support points: ends that are no nodes are extrapolated."""
     rule, dtype = program.rule, program.dtype
-    return interpolation_matrix(jnp.asarray(rule.nodes, dtype), jnp.asarray(rule.support, dtype))
+    return xp.asarray(evaluation(rule.nodes, rule.support), dtype)
 
 
 def _controls(
@@ -101,14 +104,15 @@ def _controls(
     own = slice(rule.first, rule.first + counts.nodes)
     x_nodes = program.support(w)[:, own].reshape(-1, counts.n) * scale.x[None]
     own_u = w.u.reshape(-1, counts.m)
-    turned = unwrap_angles(
+    turned = _unwrapped(
         problem, at_nodes, x_nodes[:, : problem.n], (own_u * scale.u[None])[:, : problem.m]
     )
-    turned = own_u.at[:, : problem.m].set(turned / scale.u[None, : problem.m]).reshape(w.u.shape)
+    turned = put(own_u, np.s_[:, : problem.m], turned / scale.u[None, : problem.m])
+    turned = turned.reshape(w.u.shape)
     u_lo, u_hi = limits.lo.u[:, :1], limits.hi.u[:, :1]
-    turned = jnp.where(jnp.isinf(u_lo) & jnp.isinf(u_hi), turned, w.u)
-    u = jnp.einsum("pk,skm->spm", spread, turned)
-    return jnp.clip(u, u_lo, u_hi)
+    turned = xp.where(xp.isinf(u_lo) & xp.isinf(u_hi), turned, w.u)
+    u = xp.einsum("pk,skm->spm", spread, turned)
+    return xp.clip(u, u_lo, u_hi)
 
 
 def _multipliers(
@@ -126,22 +130,22 @@ def _multipliers(
     spans = program.clocks @ w.times
     rate = (spans[:, 1] - spans[:, 0]) / 2  # dt/dtau, scaled
     clock = rate[:, None, None] * scale.t
-    weight = jnp.asarray(rule.w, dtype)[None, :, None] * clock
+    weight = xp.asarray(rule.w, dtype)[None, :, None] * clock
     # A break belongs to the segment that has it as a node: the one before it, for "lgr-right".
-    ahead = lambda a: jnp.concatenate([a[0, :1], jnp.concatenate(a[:, 1:])])
+    ahead = lambda a: xp.concatenate([a[0, :1], xp.concatenate(a[:, 1:])])
     owned = ahead if rule.first else whole
-    over_nodes = lambda a: owned(jnp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
+    over_nodes = lambda a: owned(xp.einsum("pk,skm->spm", spread, a / weight)) * scale.objective
     # A given control has no bounds' multipliers: its own is minus the Lagrangian's gradient by it.
     nodes, ends = program.derivatives(w)
     left = lagrangian_gradient(program, nodes, ends, w, solution.y).u
-    net_u = jnp.where(limits.lo.u >= limits.hi.u, -left, solution.zu.u - solution.zl.u)
+    net_u = xp.where(limits.lo.u >= limits.hi.u, -left, solution.zu.u - solution.zl.u)
     # Multipliers of state bounds live at the support points. At a segment's end a part of them may
     # be an impulse, by which the costate jumps; at an end that is no node, all of them.
     weights = np.full(len(rule.support), np.inf)
     weights[rule.first : rule.first + counts.nodes] = rule.w
     net = solution.zu.x - solution.zl.x
-    net = jnp.pad(net.at[:, -1].add(-jump), ((0, 0), (1, 0), (0, 0)))
-    state = ahead(net / (jnp.asarray(weights, dtype)[None, :, None] * clock))
+    net = xp.pad(added(net, np.s_[:, -1], -jump), ((0, 0), (1, 0), (0, 0)))
+    state = ahead(net / (xp.asarray(weights, dtype)[None, :, None] * clock))
     state = state * (scale.objective / scale.x)[None]
     n, m, r = problem.n, problem.m, counts.n - problem.n
     q = counts.end - len(program.order) - r
@@ -164,17 +168,17 @@ def _result(
 ) -> RESULTS:
     """Why the optimiser ended, or why its numbers are of no use."""
     status, w = solution.status, solution.w
-    result = RESULTS.where(
+    result = chosen_result(
         status == interior_point.CONVERGED, RESULTS.successful, RESULTS.optimiser_stopped
     )
-    result = RESULTS.where(status == interior_point.INFEASIBLE, RESULTS.infeasible, result)
-    finite = jnp.all(jnp.isfinite(program.support(w))) & jnp.all(jnp.isfinite(w.u))
-    result = RESULTS.where(finite, result, RESULTS.optimiser_stopped)
-    lost = jnp.isnan(residual) | ~jnp.isfinite(f)
-    result = RESULTS.where(lost, RESULTS.undefined, result)
+    result = chosen_result(status == interior_point.INFEASIBLE, RESULTS.infeasible, result)
+    finite = xp.all(xp.isfinite(program.support(w))) & xp.all(xp.isfinite(w.u))
+    result = chosen_result(finite, result, RESULTS.optimiser_stopped)
+    lost = xp.isnan(residual) | ~xp.isfinite(f)
+    result = chosen_result(lost, RESULTS.undefined, result)
     if not is_free(problem.final_time):
-        endless = jnp.isinf(jnp.asarray(problem.final_time, program.dtype))
-        result = RESULTS.where(endless, RESULTS.hidden_horizon, result)
+        endless = xp.isinf(xp.asarray(problem.final_time, program.dtype))
+        result = chosen_result(endless, RESULTS.hidden_horizon, result)
     return result
 
 
@@ -183,11 +187,27 @@ def _undecided(limits: Limits, solution: interior_point.Solution) -> Bool[Array,
     within a factor of `_WEAK` of sqrt(mu): there the barrier's derivative is off by a hundredth or
     more."""
     box = Box(*map(flattened, boxed(limits)))
-    small = _WEAK * jnp.sqrt(solution.mu)
-    weak = lambda gap, z, on: jnp.any(on & (gap < small) & (z < small))
+    small = _WEAK * xp.sqrt(solution.mu)
+    weak = lambda gap, z, on: xp.any(on & (gap < small) & (z < small))
     w, zl, zu = map(flattened, (solution.w, solution.zl, solution.zu))
     low, high = distances(box, w)
     return weak(low, zl, box.below) | weak(high, zu, box.above)
+
+
+def chosen_result(condition: Any, yes: RESULTS, no: RESULTS) -> RESULTS:
+    """`RESULTS.where`, which compiles nothing on the host."""
+    if isinstance(condition, jax.Array):
+        return RESULTS.where(condition, yes, no)
+    return yes if condition else no
+
+
+def _unwrapped(problem: Problem, t: Array, x: Array, u: Array) -> Array:
+    """`unwrap_angles`; on the host by a program that serves any count of nodes: the last is
+    repeated."""
+    if not on_host(t, x, u):
+        return unwrap_angles(problem, t, x, u)
+    padded = (padded_to_ladder(a) for a in (t, x, u))
+    return np.asarray(compiled(unwrap_angles, True)(problem, *padded))[: len(t)]
 
 
 class Costates(NamedTuple):
@@ -212,7 +232,7 @@ def costates(program: Transcription, limits: Limits, solution: interior_point.So
     counts, rule, w, y = program.counts, program.rule, solution.w, solution.y
     dtype, n = program.dtype, counts.n
     own = slice(rule.first, rule.first + counts.nodes)
-    weights = jnp.asarray(rule.w, dtype)
+    weights = xp.asarray(rule.w, dtype)
     # Lambda = P Lambda~ with P diagonal, the reciprocals of the integration weights: review,
     # Proposition 1 and Remark 3. Here Lambda~ is -B^T y.
     f_part = program.node_weights(y)
@@ -221,21 +241,22 @@ def costates(program: Transcription, limits: Limits, solution: interior_point.So
     start = _closure(program, solution, nodes, f_part)
     # At a shared end the next segment's costate takes over, after the multipliers of state bounds
     # there; at the last, lambda_N = dEbar/dx_N: review, eq. (24).
-    e = jnp.concatenate([jnp.ones(1, dtype), y.end]) @ ends.jacobian
+    e = xp.concatenate([xp.ones(1, dtype), y.end]) @ ends.jacobian
     net = (solution.zu.x - solution.zl.x)[:, -1]
-    after = jnp.concatenate([start[1:], e[-n:][None]])
+    after = xp.concatenate([start[1:], e[-n:][None]])
     before = after + net
     if len(rule.extra):
-        v = jnp.asarray(left_null(program.family, program.points), dtype) / weights
+        v = xp.asarray(left_null(program.family, program.points), dtype) / weights
         gamma = ((nodal[:, 0] - start) / v[0] + (nodal[:, -1] - before) / v[-1]) / 2
         nodal = nodal - v[None, :, None] * gamma[:, None]
     if own.stop == len(rule.support):
         # On a bound the costate before is that of its own polynomial; elsewhere it is continuous.
         lo, hi = limits.lo.x[:, -1], limits.hi.x[:, -1]
-        room = jnp.minimum(w.x[:, -1] - lo, hi - w.x[:, -1])
-        before = jnp.where(room < _ON_BOUND, nodal[:, -1], after)
-    lam = jnp.zeros((counts.segments, counts.after + 1, n), dtype)
-    lam = lam.at[:, own].set(nodal).at[:, 0].set(start).at[:, -1].set(before)
+        room = xp.minimum(w.x[:, -1] - lo, hi - w.x[:, -1])
+        before = xp.where(room < _ON_BOUND, nodal[:, -1], after)
+    lam = xp.zeros((counts.segments, counts.after + 1, n), dtype)
+    for at, values in ((own, nodal), (0, start), (-1, before)):
+        lam = put(lam, np.s_[:, at], values)
     return Costates(lam, before, before - after)
 
 
@@ -249,8 +270,8 @@ def _closure(
     to the state there, as the closure condition lambda_0 = -dEbar/dx_0 of the review, eq. (24), has
     it at the first."""
     rule, y = program.rule, solution.y
-    A = jnp.asarray(rule.A, program.dtype)
-    force = jnp.einsum("sko,skoi->ski", f_part, nodes.jacobian)[:, :, : program.counts.n]
-    on_support = jnp.einsum("rp,srn->spn", A, y.defect)
+    A = xp.asarray(rule.A, program.dtype)
+    force = xp.einsum("sko,skoi->ski", f_part, nodes.jacobian)[:, :, : program.counts.n]
+    on_support = xp.einsum("rp,srn->spn", A, y.defect)
     own = slice(rule.first, rule.first + program.counts.nodes)
-    return on_support.at[:, own].add(force)[:, 0]
+    return added(on_support, np.s_[:, own], force)[:, 0]

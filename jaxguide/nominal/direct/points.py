@@ -16,6 +16,14 @@ from jaxguide.arrays import Array
 from jaxguide.nominal.direct.unknowns import Scale
 from jaxguide.problem import Problem, is_free, with_parameters
 
+_LADDER = 64  # the least number of points that a program of the host evaluates
+
+
+def padded_to_ladder(a: Float[np.ndarray, "point *k"]) -> Float[np.ndarray, "more *k"]:
+    """`a` with its last entry repeated, up to a power of two: few programs serve all meshes."""
+    size = max(_LADDER, 1 << (len(a) - 1).bit_length())
+    return np.concatenate([a, np.broadcast_to(a[-1:], (size - len(a), *a.shape[1:]))])
+
 
 class Points(eqx.Module):
     """`problem` in the units of `scale`; `clocks`: how many times there are: t0, tf, free knots."""

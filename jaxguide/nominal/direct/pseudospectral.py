@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxguide.host.compilation import compiled, without_collection
+from jaxguide.host.compilation import without_collection
 from jaxguide.host.lapack import single_threaded_lapack
 from jaxguide.host.memory import physical_memory
 from jaxguide.nominal.defects import segment_errors
@@ -206,8 +206,13 @@ class Pseudospectral(Method):
         if self.log:
             units = self.units(problem, guess).items()
             print("designer units: " + ", ".join(f"{k} {v:.4g}" for k, v in units))
-        with without_collection():
-            return compiled(finished, self.quick)(problem, *_prepared(self, problem, guess))
+        with without_collection(), np.errstate(all="ignore"):
+            prepared = jax.device_get(_prepared(self, problem, guess))
+            program, start, options = prepared
+            limits = jax.device_get(limits_of(program))
+            solution = interior_point.minimise(program, limits, start, options)
+            extremal = to_extremal(jax.device_get(problem), program, limits, solution)
+            return jax.tree_util.tree_map(jnp.asarray, extremal)
 
     def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
         """Designer units: what the solver takes for one of each state, control, time, constraint

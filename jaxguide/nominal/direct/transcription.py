@@ -5,10 +5,11 @@ Every function here is evaluated node by node; nothing assembles a matrix of the
 **Source:** Ross & Karpenko, review (2012): problem P, eq. (2), as problem B^N, eq. (21).
 """
 
+import dataclasses
+import functools
 import math
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,13 +24,13 @@ from jaxguide.nominal.direct.points import (
     derivatives,
     hessian,
     hessians,
+    padded_to_ladder,
     values,
 )
 from jaxguide.nominal.direct.unknowns import Arcwise, Counts, Equations, Primal, Scale
 from jaxguide.problem import Problem
-from jaxguide.spectral import NodeFamily, legendre_matrix
-
-_LADDER = 64  # least number of points that a program of the host evaluates; doubled until all fit
+from jaxguide.spectral import NodeFamily
+from jaxguide.spectral.grids import legendre
 
 
 class Nodes(NamedTuple):
@@ -49,7 +50,16 @@ class Ends(NamedTuple):
     jacobian: Float[Array, "out in"]
 
 
-class Transcription(eqx.Module):
+_register = functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["problem", "scale", "edges", "arcwise"],
+    meta_fields=["family", "points", "log"],
+)
+
+
+@_register
+@dataclasses.dataclass(frozen=True, eq=False)
+class Transcription:
     """A Problem on S segments of `points` nodes each.
 
     - `scale`: designer units of everything.
@@ -62,17 +72,17 @@ class Transcription(eqx.Module):
     problem: Problem
     scale: Scale
     edges: Float[Array, "edge clock"]
-    family: str | NodeFamily = eqx.field(static=True)  # name or family
-    points: int = eqx.field(static=True)
+    family: str | NodeFamily  # name or family
+    points: int
     arcwise: "Arcwise | None" = None
-    log: bool = eqx.field(static=True, default=False)
+    log: bool = False
 
-    @property
+    @functools.cached_property
     def rule(self) -> Collocation:
         """Nodes, weights and defect matrices of one segment."""
         return collocation(self.family, self.points)
 
-    @property
+    @functools.cached_property
     def counts(self) -> Counts:
         """How many unknowns and equations of each kind there are."""
         problem, scale = self.problem, self.scale
@@ -88,7 +98,7 @@ class Transcription(eqx.Module):
             self.edges.shape[1],
         )
 
-    @property
+    @functools.cached_property
     def clocks(self) -> Float[Array, "segment two clock"]:
         """The linear map from the times to (t_a, t_b), the end times of every segment."""
         return xp.stack([self.edges[:-1], self.edges[1:]], axis=1)
@@ -140,7 +150,7 @@ class Transcription(eqx.Module):
         at = xp.broadcast_to(at[:, None], (counts.segments, self.points, at.shape[1]))
         return xp.concatenate([x, w.u, at], axis=2)
 
-    @property
+    @functools.cached_property
     def functions(self) -> Points:
         """The Problem's functions at a point, scaled: they know nothing of the mesh."""
         return Points(self.problem, self.scale, self.edges.shape[1])
@@ -170,7 +180,7 @@ class Transcription(eqx.Module):
         does."""
         if self.arcwise is None:
             return xp.zeros_like(u)
-        upper = _legendre(self.rule.nodes)[self.points // 2 :]
+        upper = legendre(self.rule.nodes)[self.points // 2 :]
         return xp.einsum("sm,ij,sjm...->sim...", self.arcwise.smooth, upper.T @ upper, u)
 
     @traced_once
@@ -237,14 +247,8 @@ class Transcription(eqx.Module):
         a ladder of sizes, so that few programs serve all meshes."""
         q = self.inputs(w)
         S, C = q.shape[:2]
-        size = _LADDER
-        while size < S * C:
-            size *= 2
-        padded = lambda a: np.concatenate(
-            [a, np.broadcast_to(a[-1:], (size - S * C, *a.shape[1:]))]
-        )
-        each = lambda a: padded(np.broadcast_to(a, (S, C)).reshape(-1))
-        flat = [padded(a.reshape(S * C, *a.shape[2:])) for a in (q, *weights[:1])]
+        each = lambda a: padded_to_ladder(np.broadcast_to(a, (S, C)).reshape(-1))
+        flat = [padded_to_ladder(a.reshape(S * C, *a.shape[2:])) for a in (q, *weights[:1])]
         points = (each(self.rule.nodes), each(self.rule.w), *flat)
         ends = (self.end_inputs(w), *weights[1:])
         nodes, end = jax.device_get(compiled(program, True)(self.functions, points, ends))
@@ -252,13 +256,8 @@ class Transcription(eqx.Module):
         return jax.tree_util.tree_map(back, nodes), end
 
 
-def _legendre(nodes: Float[np.ndarray, " node"]) -> Float[np.ndarray, "node node"]:
-    with jax.ensure_compile_time_eval():
-        return np.asarray(legendre_matrix(jnp.asarray(nodes)))
-
-
 def node_times(program: Transcription, w: Primal, at: np.ndarray) -> Float[Array, "segment k"]:
     """Times, in user units, of the points `at` (in tau) of every segment; review, eq. (5)."""
-    tau = jnp.asarray(at, program.dtype)
+    tau = xp.asarray(at, program.dtype)
     ends = program.clocks @ w.times * program.scale.t
     return (ends[:, :1] * (1 - tau)[None] + ends[:, 1:] * (1 + tau)[None]) / 2
