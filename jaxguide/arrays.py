@@ -17,9 +17,14 @@ import scipy.linalg
 Array = jax.Array | np.ndarray | np.generic
 
 
+_HOST = (np.ndarray, np.generic, float, int, bool, slice, type(None), str, type, np.dtype)
+
+
 def on_host(*arrays: Any) -> bool:
     """Whether none of them, or of what a list or tuple of them holds, is JAX's."""
     for a in arrays:
+        if isinstance(a, _HOST):
+            continue
         if isinstance(a, jax.Array) or (isinstance(a, (list, tuple)) and not on_host(*a)):
             return False
     return True
@@ -36,12 +41,7 @@ class _Engine:
 
         @functools.wraps(mine)
         def either(*args: Any, **options: Any) -> Any:
-            for a in args:
-                if isinstance(a, jax.Array):
-                    return theirs(*args, **options)
-                if isinstance(a, (list, tuple)) and not on_host(*a):
-                    return theirs(*args, **options)
-            return mine(*args, **options)
+            return (mine if on_host(*args) else theirs)(*args, **options)
 
         setattr(self, name, either)
         return either
@@ -128,7 +128,18 @@ def cho_solve(factor: Any, b: Any) -> Any:
 def solve_triangular(
     a: Any, b: Any, trans: int = 0, lower: bool = False, unit_diagonal: bool = False
 ) -> Any:
-    """`jax.scipy.linalg.solve_triangular`."""
+    """`jax.scipy.linalg.solve_triangular`; on the host `a` may be a batch."""
+    if on_host(a, b) and a.ndim > 2:
+        a = np.tril(a) if lower else np.triu(a)
+        if unit_diagonal:
+            a = put(a, np.s_[..., range(a.shape[-1]), range(a.shape[-1])], 1.0)
+        a = np.swapaxes(a, -1, -2) if trans else a
+        vector = b.ndim < a.ndim
+        try:
+            x = np.linalg.solve(a, b[..., None] if vector else b)
+        except np.linalg.LinAlgError:
+            x = np.full_like(b[..., None] if vector else b, np.nan)
+        return x[..., 0] if vector else x
     if not on_host(a, b):
         return jax.scipy.linalg.solve_triangular(
             a, b, trans=trans, lower=lower, unit_diagonal=unit_diagonal

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float, Int
 
-from jaxguide.arrays import Array, added, on_host, one_by_one, put, solve_triangular, xp
+from jaxguide.arrays import Array, added, on_host, one_by_one, solve_triangular, xp
 from jaxguide.nominal.direct.newton_system import COMPLIANCE, NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 
@@ -44,7 +44,10 @@ class Segments(NamedTuple):
 
 
 def over_segments(f: Any, items: Any) -> Any:
-    """`f` of every segment in turn: LAPACK under `vmap` may hang, and gains nothing on CPU."""
+    """`f` of every segment in turn: LAPACK under `vmap` may hang, and gains nothing on CPU. On the
+    host `f` takes all segments at once, so it is written for any leading axes."""
+    if on_host(*jax.tree_util.tree_leaves(items)):
+        return f(items)
     if jax.tree_util.tree_leaves(items)[0].shape[0] == 1:
         out = f(jax.tree_util.tree_map(lambda a: a[0], items))
         return jax.tree_util.tree_map(lambda a: a[None], out)
@@ -66,7 +69,7 @@ def eliminate(program: Transcription, system: NewtonSystem) -> Segments:
     weight = xp.sqrt(1 + flat(system.sigma.x, _on_controls(system)))
     A = xp.asarray(rule.A, dtype)
     diagonal = xp.einsum("rp,ab->rapb", A, xp.eye(n, dtype=dtype))  # of A X
-    one = lambda item: _null_space(program, diagonal, *item)
+    one = lambda item: _null_space(program, diagonal, *item)  # of any leading axes
     basis, order, place, V = over_segments(one, (system.nodes.jacobian, weight))
 
     nv = V.shape[2]
@@ -85,30 +88,35 @@ def _null_space(
 ) -> tuple[Array, Array, Array, Array]:
     """`basis`, `order` and `place` of one segment, see Segments, and (x, u) from v."""
     rule, n, m, C = program.rule, program.counts.n, program.counts.m, program.counts.nodes
-    dtype = weight.dtype
+    dtype, lead = weight.dtype, weight.shape[:-1]
     B = xp.asarray(rule.B, dtype)
     own = slice(rule.first, rule.first + C)
     rows = rule.A.shape[0] * n
     # The defects' Jacobian by states, controls, clock and parameters: of A X - B F.
-    F = jacobian[:, :n]
-    G = added(diagonal, np.s_[:, :, own], -xp.einsum("rk,kab->rakb", B, F[:, :, :n]))
-    to_u = -xp.einsum("rk,kaj->rakj", B, F[:, :, n : n + m]).reshape(rows, -1)
-    to_clock = -xp.einsum("rk,kaj->raj", B, F[:, :, n + m :]).reshape(rows, -1)
-    start, G = G[:, :, 0].reshape(rows, n), G[:, :, 1:].reshape(rows, -1)
-    G = xp.concatenate([G, to_u], axis=1) / weight[None]
+    F = jacobian[..., :n, :]
+    G = xp.broadcast_to(diagonal, (*lead, *diagonal.shape))
+    G = added(G, np.s_[..., own, :], -xp.einsum("rk,...kab->...rakb", B, F[..., :n]))
+    to_u = -xp.einsum("rk,...kaj->...rakj", B, F[..., n : n + m]).reshape(*lead, rows, -1)
+    to_clock = -xp.einsum("rk,...kaj->...raj", B, F[..., n + m :]).reshape(*lead, rows, -1)
+    start = G[..., 0, :].reshape(*lead, rows, n)
+    G = xp.concatenate([G[..., 1:, :].reshape(*lead, rows, -1), to_u], axis=-1)
+    G = G / weight[..., None, :]
 
-    lu, order = _lu_with_order(G.T)
-    basis = lu[:rows]
-    place = put(xp.zeros_like(order), order, xp.arange(len(order), dtype=order.dtype))
+    lu, order = _lu_with_order(xp.swapaxes(G, -1, -2))
+    basis = lu[..., :rows, :]
+    place = xp.argsort(order, axis=-1)
     # Basic entries from the free ones, and from start, clock and parameters.
-    free = -solve_triangular(basis, lu[rows:].T, trans=1, lower=True, unit_diagonal=True)
-    follow = -basic_entries(basis, xp.concatenate([start, to_clock], axis=1))
-    one = xp.eye(free.shape[1], dtype=dtype)
+    rest = xp.swapaxes(lu[..., rows:, :], -1, -2)
+    free = -solve_triangular(basis, rest, trans=1, lower=True, unit_diagonal=True)
+    follow = -basic_entries(basis, xp.concatenate([start, to_clock], axis=-1))
+    k = free.shape[-1]
+    one = xp.eye(k, follow.shape[-1] + k, n, dtype=dtype)
     V = xp.concatenate([
-        xp.concatenate([follow[:, :n], free, follow[:, n:]], axis=1),
-        xp.pad(one, ((0, 0), (n, follow.shape[1] - n))),
-    ])[place]  # fmt: skip
-    return basis, order, place, V / weight[:, None]
+        xp.concatenate([follow[..., :n], free, follow[..., n:]], axis=-1),
+        xp.broadcast_to(one, (*lead, *one.shape)),
+    ], axis=-2)  # fmt: skip
+    V = xp.take_along_axis(V, place[..., None], axis=-2)
+    return basis, order, place, V / weight[..., None]
 
 
 def _quadratic(
@@ -133,7 +141,7 @@ def _quadratic(
 
 
 def _times(W: Array, T: Array) -> Array:
-    return xp.einsum("skab,skbv->skav", W, T)
+    return W @ T
 
 
 def gram(
@@ -141,7 +149,7 @@ def gram(
 ) -> Float[Array, "segment v v"]:
     """a^T b of every segment, summed over its points and their entries."""
     flat = lambda a: a.reshape(a.shape[0], -1, a.shape[3])
-    return xp.einsum("siv,siw->svw", flat(a), flat(b))
+    return xp.swapaxes(flat(a), 1, 2) @ flat(b)
 
 
 def on_diagonal(
@@ -171,7 +179,12 @@ def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " r
     return lu[:, :columns], xp.clip(order, 0, rows - 1).astype(xp.int32)
 
 
-def _lu_on_host(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
+def _lu_on_host(
+    a: Float[Array, "*segment row column"],
+) -> tuple[Array, Int[Array, "*segment row"]]:
+    if a.ndim > 2:
+        lu, order = zip(*map(_lu_on_host, a), strict=True)
+        return np.stack(lu), np.stack(order)
     lu, exchanges, _ = scipy.linalg.lapack.dgetrf(a)
     order = np.arange(len(a), dtype=np.int32)
     for k, other in enumerate(exchanges):

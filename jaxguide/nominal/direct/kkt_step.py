@@ -121,6 +121,11 @@ def eliminated_step(
     return Step(primal, Equations(defect, path, ends.nu))
 
 
+def _flat(a: Array) -> Array:
+    """Points and their entries as rows: (segment, row, v)."""
+    return a.reshape(a.shape[0], -1, a.shape[3])
+
+
 def _by_segment(a: Array) -> Array:
     return a.reshape(a.shape[0], -1)
 
@@ -132,8 +137,8 @@ def _particular(program: Transcription, segments: Segments, residual: Equations)
 
     def one(item: tuple) -> Array:
         basis, place, size, c = item
-        moved = put(xp.zeros_like(size), np.s_[: len(c)], -basic_entries(basis, c))
-        return moved[place] / size
+        moved = put(xp.zeros_like(size), np.s_[..., : c.shape[-1]], -basic_entries(basis, c))
+        return xp.take_along_axis(moved, place, axis=-1) / size
 
     items = (segments.basis, segments.place, segments.size, _by_segment(residual.defect))
     both = over_segments(one, items)
@@ -155,13 +160,12 @@ def _pull(
     """The forces on v that the load and the particular solution leave."""
     n, m = program.counts.n, program.counts.m
     force = load.force
-    f = xp.einsum("skab,skb->ska", factor.W[..., : n + m], bar.q)
+    f = (factor.W[..., : n + m] @ bar.q[..., None])[..., 0]
     f = added(f, np.s_[:, :, n : n + m], program.roughness(bar.u))
     f = f + xp.einsum("skha,skh->ska", system.nodes.jacobian[:, :, n + 1 :], pushed)
     on_states = force.x + (system.sigma.x + factor.delta) * bar.x
-    h = xp.einsum("skav,ska->sv", segments.T, f)
-    h = h + xp.einsum("sknv,skn->sv", segments.X, on_states)
-    return h + xp.einsum("skmv,skm->sv", segments.U, force.u)
+    back = lambda a, on: (xp.swapaxes(_flat(a), 1, 2) @ on.reshape(on.shape[0], -1, 1))[..., 0]
+    return back(segments.T, f) + back(segments.X, on_states) + back(segments.U, force.u)
 
 
 def _backward(factor: Factor, h: Float[Array, "segment v"], bar: _Particular) -> _Sweep:
@@ -222,9 +226,9 @@ def _forward(
     by_segment = (sweep.k, sweep.p_after, program.clocks)
     items = (factor.stages, segments.X[:, -1], bar.x[:, -1], *by_segment)
     _, (v, costate) = scan(forward, ends.theta, items)
-    dx = xp.einsum("sknv,sv->skn", segments.X, v) + bar.x
-    du = xp.einsum("skmv,sv->skm", segments.U, v) + bar.u
-    dq = added(xp.einsum("skav,sv->ska", segments.T, v), np.s_[:, :, : n + m], bar.q)
+    of = lambda a: (_flat(a) @ v[..., None]).reshape(a.shape[:3])
+    dx, du = of(segments.X) + bar.x, of(segments.U) + bar.u
+    dq = added(of(segments.T), np.s_[:, :, : n + m], bar.q)
     return _Forward(dx, du, dq, costate)
 
 
@@ -243,7 +247,7 @@ def _defect_multipliers(
     n, m, S, C = counts.n, counts.m, counts.segments, counts.nodes
     own = slice(rule.first, rule.first + C)
     h_xu = system.nodes.jacobian[:, :, n + 1 :][..., : n + m]
-    f = xp.einsum("skab,skb->ska", factor.W[:, :, : n + m], moved.q)
+    f = (factor.W[:, :, : n + m] @ moved.q[..., None])[..., 0]
     f = added(f, np.s_[:, :, n:], program.roughness(moved.u))
     f = f + xp.einsum("skha,skh->ska", h_xu, pushed)
     on_states = xp.zeros((S, counts.after + 1, n), f.dtype)
@@ -255,7 +259,7 @@ def _defect_multipliers(
 
     def one(item: tuple) -> Array:
         basis, order, size, f = item
-        f = (f / size)[order[: len(basis)]]
+        f = xp.take_along_axis(f / size, order[..., : basis.shape[-1]], axis=-1)
         f = solve_triangular(basis, f, lower=True, unit_diagonal=True)
         return -solve_triangular(basis, f)
 

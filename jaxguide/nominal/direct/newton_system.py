@@ -67,7 +67,7 @@ def times_step(
     A, B = (xp.asarray(a, delta.dtype) for a in (rule.A, rule.B))
     dq, db = program.inputs(dw), program.end_inputs(dw)
     on_q, on_b, on_support = forces(program, system.nodes, system.ends, y, 0.0)
-    on_q = on_q + xp.einsum("skab,skb->ska", system.node_hessian, dq)
+    on_q = on_q + (system.node_hessian @ dq[..., None])[..., 0]
     on_b = on_b + system.end_hessian @ db
     force = gather(program, dw, on_q, on_b, on_support)
     force = force._replace(u=force.u + program.roughness(dw.u))
