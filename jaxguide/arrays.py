@@ -50,6 +50,11 @@ class _Engine:
 xp: Any = _Engine()
 
 
+def on_device(tree: Any) -> Any:
+    """`tree` with JAX's arrays for the host's, without a compilation."""
+    return jax.tree_util.tree_map(lambda a: jax.device_put(a) if on_host(a) else a, tree)
+
+
 def put(a: Any, at: Any, values: Any) -> Any:
     """`a` with `values` at the indices `at`."""
     if on_host(a, values):

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxguide.arrays import Array, added, on_host, put, xp
+from jaxguide.arrays import Array, added, on_device, on_host, put, xp
 from jaxguide.conditions.angles import unwrap_angles
 from jaxguide.host.compilation import compiled
 from jaxguide.nominal.direct import interior_point
@@ -53,21 +53,24 @@ def to_extremal(
     to_user = (scale.objective / scale.x)[None, :n]
     f, _ = program.objective_and_residual(w)
     residual = xp.maximum(solution.error, solution.violation)
+    numbers = {
+        "t": _times(program, solution),
+        "x": x,
+        "u": (whole(u) * scale.u[None])[:, :m],
+        "reference_nodes": xp.asarray(rule.support, program.dtype),
+        "u_before": (u[:, -1] * scale.u[None])[:, :m],
+        "costate": whole(covectors.at_support)[:, :n] * to_user,
+        "costate_before": covectors.before[:, :n] * to_user,
+        "final_time": w.times[1] * scale.t,
+        "objective": f * scale.objective,
+        "residual": residual,
+        "degenerate": _undecided(limits, solution),
+    }
     return Extremal(
-        t=_times(program, solution),
-        x=x,
-        u=(whole(u) * scale.u[None])[:, :m],
-        reference_nodes=xp.asarray(rule.support, program.dtype),
-        u_before=(u[:, -1] * scale.u[None])[:, :m],
-        costate=whole(covectors.at_support)[:, :n] * to_user,
-        costate_before=covectors.before[:, :n] * to_user,
-        final_time=w.times[1] * scale.t,
-        objective=f * scale.objective,
+        **on_device(numbers),
         multipliers=_multipliers(problem, program, limits, solution, covectors.jump, spread),
         result=_result(problem, program, solution, f, residual),
-        residual=residual,
-        degenerate=_undecided(limits, solution),
-        problem=problem,
+        problem=on_device(problem),
         chosen=chosen,
     )
 
@@ -150,13 +153,14 @@ def _multipliers(
     n, m, r = problem.n, problem.m, counts.n - problem.n
     q = counts.end - len(program.order) - r
     nu = solution.y.end * scale.objective / scale.end
-    return Multipliers(
+    numbers = (
         nu[:q],
         over_nodes(solution.y.path) / scale.path[None],
         state[:, :n],
         (over_nodes(net_u) / scale.u[None])[:, :m],
         nu[q : q + r],
     )
+    return Multipliers(*on_device(numbers))
 
 
 def _result(

@@ -162,7 +162,9 @@ def on_diagonal(
     return whole[..., None] * xp.eye(inputs, dtype=diagonal.dtype)[None, None]
 
 
-def _lu_with_order(a: Float[Array, "row column"]) -> tuple[Array, Int[Array, " row"]]:
+def _lu_with_order(
+    a: Float[Array, "*segment row column"],
+) -> tuple[Array, Int[Array, "*segment row"]]:
     """L and U, in one array, of the rows of `a`, and the `order` of rows that pivoting chose.
 
     The order is read off a further column, which holds the rows' numbers: (L U)_last, rounded. XLA
@@ -192,10 +194,9 @@ def _lu_on_host(
     return lu, order
 
 
-def basic_entries(
-    basis: Float[Array, "row row"], b: Float[Array, "row *k"]
-) -> Float[Array, "row *k"]:
-    """The basic entries that make the defects of one segment `b`, the free ones being zero."""
+def basic_entries(basis: Float[Array, "*segment row row"], b: Array) -> Array:
+    """The basic entries that make the defects `b` (*segment, row) or (*segment, row, k), the free
+    ones being zero."""
     y = solve_triangular(basis, b, trans=1)
     return solve_triangular(basis, y, trans=1, lower=True, unit_diagonal=True)
 

@@ -211,8 +211,7 @@ class Pseudospectral(Method):
             program, start, options = prepared
             limits = jax.device_get(limits_of(program))
             solution = interior_point.minimise(program, limits, start, options)
-            extremal = to_extremal(jax.device_get(problem), program, limits, solution)
-            return jax.tree_util.tree_map(jnp.asarray, extremal)
+            return to_extremal(jax.device_get(problem), program, limits, solution)
 
     def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
         """Designer units: what the solver takes for one of each state, control, time, constraint

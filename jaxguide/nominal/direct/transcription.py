@@ -50,14 +50,10 @@ class Ends(NamedTuple):
     jacobian: Float[Array, "out in"]
 
 
-_register = functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["problem", "scale", "edges", "arcwise"],
-    meta_fields=["family", "points", "log"],
-)
+_LEAVES, _STATIC = ("problem", "scale", "edges", "arcwise"), ("family", "points", "log")
 
 
-@_register
+@jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, eq=False)
 class Transcription:
     """A Problem on S segments of `points` nodes each.
@@ -76,6 +72,22 @@ class Transcription:
     points: int
     arcwise: "Arcwise | None" = None
     log: bool = False
+
+    # A plain class: its attributes are read ten thousand times in a solve on the host.
+
+    def tree_flatten_with_keys(self) -> tuple[Any, Any]:
+        """Leaves with their names, and what is static."""
+        key = jax.tree_util.GetAttrKey
+        leaves = [(key(name), getattr(self, name)) for name in _LEAVES]
+        return leaves, tuple(getattr(self, name) for name in _STATIC)
+
+    @classmethod
+    def tree_unflatten(cls, static: Any, leaves: Any) -> "Transcription":
+        """The inverse, for leaves of any kind."""
+        out = object.__new__(cls)
+        for name, value in zip((*_LEAVES, *_STATIC), (*leaves, *static), strict=True):
+            object.__setattr__(out, name, value)
+        return out
 
     @functools.cached_property
     def rule(self) -> Collocation:

@@ -2,8 +2,9 @@
 
 from typing import Any, NamedTuple
 
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxguide.arrays import Array
 from jaxguide.nominal.direct.box import Box
 from jaxguide.nominal.direct.interior_point.filter import Filter
 from jaxguide.nominal.direct.transcription import Transcription
