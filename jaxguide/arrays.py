@@ -7,25 +7,28 @@ and becomes one program, on the host it is NumPy's and SciPy's and compiles noth
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+from scipy.linalg import get_lapack_funcs
 
-Array = jax.Array | np.ndarray | np.generic
+if TYPE_CHECKING:
+    Array = jax.Array  # a type checker need not tell the engines apart
+else:
+    Array = jax.Array | np.ndarray | np.generic
 
 
 _HOST = (np.ndarray, np.generic, float, int, bool, slice, type(None), str, type, np.dtype)
 
 
-def on_host(*arrays: Any) -> bool:
+def on_numpy(*arrays: Any) -> bool:
     """Whether none of them, or of what a list or tuple of them holds, is JAX's."""
     for a in arrays:
         if isinstance(a, _HOST):
             continue
-        if isinstance(a, jax.Array) or (isinstance(a, (list, tuple)) and not on_host(*a)):
+        if isinstance(a, jax.Array) or (isinstance(a, (list, tuple)) and not on_numpy(*a)):
             return False
     return True
 
@@ -41,7 +44,7 @@ class _Engine:
 
         @functools.wraps(mine)
         def either(*args: Any, **options: Any) -> Any:
-            return (mine if on_host(*args) else theirs)(*args, **options)
+            return (mine if on_numpy(*args) else theirs)(*args, **options)
 
         setattr(self, name, either)
         return either
@@ -49,15 +52,17 @@ class _Engine:
 
 xp: Any = _Engine()
 
+_potrf, _potrs, _trtrs, _getrf = get_lapack_funcs(("potrf", "potrs", "trtrs", "getrf"))
+
 
 def on_device(tree: Any) -> Any:
     """`tree` with JAX's arrays for the host's, without a compilation."""
-    return jax.tree_util.tree_map(lambda a: jax.device_put(a) if on_host(a) else a, tree)
+    return jax.tree_util.tree_map(lambda a: jax.device_put(a) if on_numpy(a) else a, tree)
 
 
 def put(a: Any, at: Any, values: Any) -> Any:
     """`a` with `values` at the indices `at`."""
-    if on_host(a, values):
+    if on_numpy(a, values):
         out = np.array(a)
         out[at] = values
         return out
@@ -66,7 +71,7 @@ def put(a: Any, at: Any, values: Any) -> Any:
 
 def added(a: Any, at: Any, values: Any) -> Any:
     """`a` with `values` added at the indices `at`, each of which is named once."""
-    if on_host(a, values):
+    if on_numpy(a, values):
         out = np.array(a)
         out[at] += values
         return out
@@ -75,7 +80,7 @@ def added(a: Any, at: Any, values: Any) -> Any:
 
 def loop(going: Callable, body: Callable, carry: Any) -> Any:
     """`jax.lax.while_loop`."""
-    if not on_host(*jax.tree_util.tree_leaves(carry)):
+    if not on_numpy(*jax.tree_util.tree_leaves(carry)):
         return jax.lax.while_loop(going, body, carry)
     while going(carry):
         carry = body(carry)
@@ -92,17 +97,17 @@ def either(condition: Any, yes: Callable, no: Callable) -> Any:
 def scan(step: Callable, carry: Any, items: Any, reverse: bool = False) -> tuple[Any, Any]:
     """`jax.lax.scan`."""
     leaves, structure = jax.tree_util.tree_flatten(items)
-    if not on_host(*leaves, *jax.tree_util.tree_leaves(carry)):
+    if not on_numpy(*leaves, *jax.tree_util.tree_leaves(carry)):
         return jax.lax.scan(step, carry, items, reverse=reverse)
     out: list[Any] = []
     for k in range(len(leaves[0])):
         at = -1 - k if reverse else k
         carry, one = step(carry, structure.unflatten([a[at] for a in leaves]))
         out.append(one)
-    return carry, stacked(out[::-1] if reverse else out)
+    return carry, stacked_trees(out[::-1] if reverse else out)
 
 
-def stacked(trees: list[Any]) -> Any:
+def stacked_trees(trees: list[Any]) -> Any:
     """One tree of the host's arrays from several, along a new leading axis."""
     return jax.tree_util.tree_map(lambda *a: np.stack(a), *trees)
 
@@ -110,31 +115,33 @@ def stacked(trees: list[Any]) -> Any:
 def one_by_one(f: Callable, items: Any) -> Any:
     """`jax.lax.map`."""
     leaves, structure = jax.tree_util.tree_flatten(items)
-    if not on_host(*leaves):
+    if not on_numpy(*leaves):
         return jax.lax.map(f, items)
-    return stacked([f(structure.unflatten([a[k] for a in leaves])) for k in range(len(leaves[0]))])
+    return stacked_trees(
+        [f(structure.unflatten([a[k] for a in leaves])) for k in range(len(leaves[0]))]
+    )
 
 
 def cholesky(a: Any) -> Any:
     """The lower factor; NaN where `a` is not positive definite."""
-    if not on_host(a):
+    if not on_numpy(a):
         return jnp.linalg.cholesky(a)
-    factor, info = scipy.linalg.lapack.dpotrf(a, lower=1, clean=1)
+    factor, info = _potrf(a, lower=1, clean=1)
     return factor if info == 0 else np.full_like(a, np.nan)
 
 
 def cho_solve(factor: Any, b: Any) -> Any:
     """A^-1 b from the lower Cholesky factor of A."""
-    if not on_host(factor, b):
+    if not on_numpy(factor, b):
         return jax.scipy.linalg.cho_solve((factor, True), b)
-    return scipy.linalg.lapack.dpotrs(factor, b, lower=1)[0]
+    return _potrs(factor, b, lower=1)[0]
 
 
 def solve_triangular(
     a: Any, b: Any, trans: int = 0, lower: bool = False, unit_diagonal: bool = False
 ) -> Any:
     """`jax.scipy.linalg.solve_triangular`; on the host `a` may be a batch."""
-    if on_host(a, b) and a.ndim > 2:
+    if on_numpy(a, b) and a.ndim > 2:
         a = np.tril(a) if lower else np.triu(a)
         if unit_diagonal:
             a = put(a, np.s_[..., range(a.shape[-1]), range(a.shape[-1])], 1.0)
@@ -145,19 +152,31 @@ def solve_triangular(
         except np.linalg.LinAlgError:
             x = np.full_like(b[..., None] if vector else b, np.nan)
         return x[..., 0] if vector else x
-    if not on_host(a, b):
+    if not on_numpy(a, b):
         return jax.scipy.linalg.solve_triangular(
             a, b, trans=trans, lower=lower, unit_diagonal=unit_diagonal
         )
     if not b.size:
         return b
-    x, info = scipy.linalg.lapack.dtrtrs(a, b, lower, trans, unit_diagonal)
+    x, info = _trtrs(a, b, lower, trans, unit_diagonal)
     return x if info == 0 else np.full_like(x, np.nan)
+
+
+def pivoted_lu(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L and U of each matrix of the host, in one array, and the order of rows by pivoting."""
+    if a.ndim > 2:
+        lu, order = zip(*map(pivoted_lu, a), strict=True)
+        return np.stack(lu), np.stack(order)
+    lu, exchanges, _ = _getrf(a)
+    order = np.arange(len(a), dtype=np.int32)
+    for k, other in enumerate(exchanges):
+        order[k], order[other] = order[other], order[k]
+    return lu, order
 
 
 def eigh(a: Any) -> Any:
     """Eigenvalues and vectors; NaN where there are none."""
-    if not on_host(a):
+    if not on_numpy(a):
         return jnp.linalg.eigh(a)
     try:
         return tuple(np.linalg.eigh(a))
@@ -171,7 +190,17 @@ def traced_once(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def called(*args: Any) -> Any:
-        host = on_host(*jax.tree_util.tree_leaves(args[1:] or args))
+        host = on_numpy(*jax.tree_util.tree_leaves(args[1:] or args))
         return function(*args) if host else program(*args)
 
     return called
+
+
+_LADDER = 64  # the least number of points that a program of the host evaluates
+
+
+def padded_to_ladder(a: Any) -> Any:
+    """`a` (point, ...) of the host with its last entry repeated, up to a power of two: few programs
+    serve all meshes."""
+    size = max(_LADDER, 1 << (len(a) - 1).bit_length())
+    return np.concatenate([a, np.broadcast_to(a[-1:], (size - len(a), *a.shape[1:]))])

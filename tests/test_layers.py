@@ -19,6 +19,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "types",
         "trig",
         "linalg",
+        "arrays",
         "bounds",
         "host",
         "spectral",
@@ -73,6 +74,7 @@ ORDER: dict[str, tuple[str, ...]] = {
     "nominal.direct": (
         "collocation",
         "unknowns",
+        "points",
         "transcription",
         "trees",
         "limits",

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxguide.arrays import Array, added, on_device, on_host, put, xp
+from jaxguide.arrays import Array, added, on_device, on_numpy, padded_to_ladder, put, xp
 from jaxguide.conditions.angles import unwrap_angles
 from jaxguide.host.compilation import compiled
 from jaxguide.nominal.direct import interior_point
@@ -17,7 +17,6 @@ from jaxguide.nominal.direct.box import Box, boxed, distances
 from jaxguide.nominal.direct.collocation import left_null
 from jaxguide.nominal.direct.limits import Limits
 from jaxguide.nominal.direct.newton_system import lagrangian_gradient
-from jaxguide.nominal.direct.points import padded_to_ladder
 from jaxguide.nominal.direct.transcription import Nodes, Transcription, node_times
 from jaxguide.nominal.direct.unknowns import flattened
 from jaxguide.problem import Problem, choices, is_free, with_parameters
@@ -208,10 +207,10 @@ def chosen_result(condition: Any, yes: RESULTS, no: RESULTS) -> RESULTS:
 def _unwrapped(problem: Problem, t: Array, x: Array, u: Array) -> Array:
     """`unwrap_angles`; on the host by a program that serves any count of nodes: the last is
     repeated."""
-    if not on_host(t, x, u):
+    if not on_numpy(t, x, u):
         return unwrap_angles(problem, t, x, u)
     padded = (padded_to_ladder(a) for a in (t, x, u))
-    return np.asarray(compiled(unwrap_angles, True)(problem, *padded))[: len(t)]
+    return jax.device_get(compiled(unwrap_angles, True)(problem, *padded))[: len(t)]
 
 
 class Costates(NamedTuple):

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float, Int
 
-from jaxguide.arrays import Array, added, on_host, one_by_one, solve_triangular, xp
+from jaxguide.arrays import Array, added, on_numpy, one_by_one, pivoted_lu, solve_triangular, xp
 from jaxguide.nominal.direct.newton_system import COMPLIANCE, NewtonSystem
 from jaxguide.nominal.direct.transcription import Transcription
 
@@ -46,7 +45,7 @@ class Segments(NamedTuple):
 def over_segments(f: Any, items: Any) -> Any:
     """`f` of every segment in turn: LAPACK under `vmap` may hang, and gains nothing on CPU. On the
     host `f` takes all segments at once, so it is written for any leading axes."""
-    if on_host(*jax.tree_util.tree_leaves(items)):
+    if on_numpy(*jax.tree_util.tree_leaves(items)):
         return f(items)
     if jax.tree_util.tree_leaves(items)[0].shape[0] == 1:
         out = f(jax.tree_util.tree_map(lambda a: a[0], items))
@@ -126,7 +125,7 @@ def _quadratic(
     rule, n, inputs = program.rule, program.counts.n, T.shape[2]
     stiffness, _ = path_springs(system)
     h_q = system.nodes.jacobian[:, :, n + 1 :]
-    W = system.node_hessian + xp.einsum("skha,skh,skhb->skab", h_q, stiffness, h_q)
+    W = system.node_hessian + xp.swapaxes(h_q, 2, 3) @ (stiffness[..., None] * h_q)
     W = W + on_diagonal(_on_controls(system), n, inputs)
     # Where every point after the first is a node, its barrier joins the node's own Hessian.
     sigma = xp.pad(system.sigma.x, ((0, 0), (1, 0), (0, 0)))
@@ -170,8 +169,8 @@ def _lu_with_order(
     The order is read off a further column, which holds the rows' numbers: (L U)_last, rounded. XLA
     finds it from LAPACK's exchanges one by one, which took longer than the factorisation.
     """
-    if on_host(a):
-        return _lu_on_host(a)
+    if on_numpy(a):
+        return pivoted_lu(a)  # pyright: ignore[reportReturnType]
     rows, columns = a.shape
     numbers = xp.arange(rows, dtype=a.dtype)[:, None]
     lu = jax.lax.linalg.lu(xp.concatenate([a, numbers], axis=1))[0]
@@ -179,19 +178,6 @@ def _lu_with_order(
     lower = xp.tril(lu[:, :k], -1) + xp.eye(rows, k, dtype=a.dtype)
     order = xp.round(lower @ lu[:k, columns])
     return lu[:, :columns], xp.clip(order, 0, rows - 1).astype(xp.int32)
-
-
-def _lu_on_host(
-    a: Float[Array, "*segment row column"],
-) -> tuple[Array, Int[Array, "*segment row"]]:
-    if a.ndim > 2:
-        lu, order = zip(*map(_lu_on_host, a), strict=True)
-        return np.stack(lu), np.stack(order)
-    lu, exchanges, _ = scipy.linalg.lapack.dgetrf(a)
-    order = np.arange(len(a), dtype=np.int32)
-    for k, other in enumerate(exchanges):
-        order[k], order[other] = order[other], order[k]
-    return lu, order
 
 
 def basic_entries(basis: Float[Array, "*segment row row"], b: Array) -> Array:

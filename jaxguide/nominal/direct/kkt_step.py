@@ -104,7 +104,8 @@ def eliminated_step(
     defect = _defect_multipliers(program, system, segments, factor, load, moved, pushed)
 
     # Path and endpoint slacks, from their equations.
-    h_dq = xp.einsum("skha,ska->skh", system.nodes.jacobian[:, :, program.counts.n + 1 :], moved.q)
+    h_q = system.nodes.jacobian[:, :, program.counts.n + 1 :]
+    h_dq = (h_q @ moved.q[..., None])[..., 0]
     path = stiffness * h_dq + pushed
     d_path = h_dq + residual.path - COMPLIANCE * path
     at = sweep_layout(program.counts)
@@ -162,7 +163,7 @@ def _pull(
     force = load.force
     f = (factor.W[..., : n + m] @ bar.q[..., None])[..., 0]
     f = added(f, np.s_[:, :, n : n + m], program.roughness(bar.u))
-    f = f + xp.einsum("skha,skh->ska", system.nodes.jacobian[:, :, n + 1 :], pushed)
+    f = f + (pushed[:, :, None] @ system.nodes.jacobian[:, :, n + 1 :])[:, :, 0]
     on_states = force.x + (system.sigma.x + factor.delta) * bar.x
     back = lambda a, on: (xp.swapaxes(_flat(a), 1, 2) @ on.reshape(on.shape[0], -1, 1))[..., 0]
     return back(segments.T, f) + back(segments.X, on_states) + back(segments.U, force.u)
@@ -249,7 +250,7 @@ def _defect_multipliers(
     h_xu = system.nodes.jacobian[:, :, n + 1 :][..., : n + m]
     f = (factor.W[:, :, : n + m] @ moved.q[..., None])[..., 0]
     f = added(f, np.s_[:, :, n:], program.roughness(moved.u))
-    f = f + xp.einsum("skha,skh->ska", h_xu, pushed)
+    f = f + (pushed[:, :, None] @ h_xu)[:, :, 0]
     on_states = xp.zeros((S, counts.after + 1, n), f.dtype)
     on_states = put(on_states, np.s_[:, own], f[..., :n])[:, 1:]
     on_states = on_states + load.force.x + (system.sigma.x + factor.delta) * moved.x

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxguide.arrays import Array, added, on_host, put, traced_once, xp
+from jaxguide.arrays import Array, added, on_numpy, put, traced_once, xp
 from jaxguide.nominal.direct.transcription import Ends, Nodes, Transcription
 from jaxguide.nominal.direct.unknowns import Equations, Primal
 
@@ -79,9 +79,9 @@ def times_step(
         end=slack(y.end, system.sigma.end, dw.end, system.given.end),
     )
     e_b = system.ends.jacobian[1:]
-    defect = xp.einsum("rp,spn->srn", A, program.support(dw))
-    defect = defect - xp.einsum("rk,skna,ska->srn", B, J[:, :, :n], dq)
-    path = xp.einsum("skha,ska->skh", J[:, :, n + 1 :], dq) - dw.path - COMPLIANCE * y.path
+    df = (J @ dq[..., None])[..., 0]  # of rates, running cost and path constraints
+    defect = A @ program.support(dw) - B @ df[:, :, :n]
+    path = df[:, :, n + 1 :] - dw.path - COMPLIANCE * y.path
     return Load(force, Equations(defect, path, e_b @ db - dw.end))
 
 
@@ -92,17 +92,17 @@ def forces(
     (of the defects' part A X alone) the states at the support points."""
     n = program.counts.n
     weights = put(program.node_weights(y), np.s_[:, :, n], cost)
-    on_q = xp.einsum("sko,skoa->ska", weights, nodes.jacobian)
+    on_q = (weights[:, :, None] @ nodes.jacobian)[:, :, 0]
     on_b = cost * ends.jacobian[0] + y.end @ ends.jacobian[1:]
     A = xp.asarray(program.rule.A, y.defect.dtype)
-    return on_q, on_b, xp.einsum("rp,srn->spn", A, y.defect)
+    return on_q, on_b, A.T @ y.defect
 
 
 def gather(
     program: Transcription, like: Primal, on_q: Array, on_b: Array, on_support: Array
 ) -> Primal:
     """`forces` as derivatives with respect to the unknowns themselves, shaped `like` a Primal."""
-    if on_host(on_q):
+    if on_numpy(on_q):
         return _gathered(program, like, on_q, on_b, on_support)
 
     def spread(w: Primal) -> tuple[Array, Array, Array]:

@@ -1,5 +1,5 @@
-"""A Problem's functions at one point of a mesh, scaled, and the small programs that evaluate them at
-many: of any mesh, for they know nothing of it.
+"""A Problem's functions at one point of a mesh, scaled, and the small programs that evaluate them
+at many: of any mesh, for they know nothing of it.
 
 **Source:** Ross & Karpenko, review (2012): problem P, eq. (2).
 """
@@ -16,16 +16,8 @@ from jaxguide.arrays import Array
 from jaxguide.nominal.direct.unknowns import Scale
 from jaxguide.problem import Problem, is_free, with_parameters
 
-_LADDER = 64  # the least number of points that a program of the host evaluates
 
-
-def padded_to_ladder(a: Float[np.ndarray, "point *k"]) -> Float[np.ndarray, "more *k"]:
-    """`a` with its last entry repeated, up to a power of two: few programs serve all meshes."""
-    size = max(_LADDER, 1 << (len(a) - 1).bit_length())
-    return np.concatenate([a, np.broadcast_to(a[-1:], (size - len(a), *a.shape[1:]))])
-
-
-class Points(eqx.Module):
+class PointFunctions(eqx.Module):
     """`problem` in the units of `scale`; `clocks`: how many times there are: t0, tf, free knots."""
 
     problem: Problem
@@ -62,12 +54,12 @@ class Points(eqx.Module):
         return jnp.concatenate([cost[None], e, self.order @ times])
 
 
-def values(functions: Points, points: tuple, ends: tuple) -> tuple[Array, Array]:
+def point_values(functions: PointFunctions, points: tuple, ends: tuple) -> tuple[Array, Array]:
     """Values at `points` (tau, weight, input) and at the ends."""
     return jax.vmap(functions.node)(*points), functions.end(*ends)
 
 
-def derivatives(functions: Points, points: tuple, ends: tuple) -> tuple[Any, Any]:
+def point_derivatives(functions: PointFunctions, points: tuple, ends: tuple) -> tuple[Any, Any]:
     """Values and Jacobians at `points` (tau, weight, input) and at the ends."""
     twice = lambda f: lambda *a: (lambda v: (v, v))(f(*a))
     jacobian, value = jax.vmap(jax.jacfwd(twice(functions.node), 2, has_aux=True))(*points)
@@ -75,7 +67,7 @@ def derivatives(functions: Points, points: tuple, ends: tuple) -> tuple[Any, Any
     return (value, jacobian), (end_value, end_jacobian)
 
 
-def hessians(functions: Points, points: tuple, ends: tuple) -> tuple[Array, Array]:
+def point_hessians(functions: PointFunctions, points: tuple, ends: tuple) -> tuple[Array, Array]:
     """Hessians of the functions' sum with `weights`, the last of `points` and of `ends`."""
     node = lambda tau, w, q, c: jnp.dot(c, functions.node(tau, w, q))
     end = lambda b, c: jnp.dot(c, functions.end(b))

@@ -15,17 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxguide.arrays import Array, on_host, traced_once, xp
+from jaxguide.arrays import Array, on_numpy, padded_to_ladder, traced_once, xp
 from jaxguide.host.compilation import compiled
 from jaxguide.nominal.direct.collocation import Collocation, collocation
 from jaxguide.nominal.direct.points import (
-    Points,
+    PointFunctions,
     clock_order,
-    derivatives,
     hessian,
-    hessians,
-    padded_to_ladder,
-    values,
+    point_derivatives,
+    point_hessians,
+    point_values,
 )
 from jaxguide.nominal.direct.unknowns import Arcwise, Counts, Equations, Primal, Scale
 from jaxguide.problem import Problem
@@ -163,9 +162,9 @@ class Transcription:
         return xp.concatenate([x, w.u, at], axis=2)
 
     @functools.cached_property
-    def functions(self) -> Points:
+    def functions(self) -> PointFunctions:
         """The Problem's functions at a point, scaled: they know nothing of the mesh."""
-        return Points(self.problem, self.scale, self.edges.shape[1])
+        return PointFunctions(self.problem, self.scale, self.edges.shape[1])
 
     def end_inputs(self, w: Primal) -> Float[Array, " in"]:
         """(x0, times, p, xf)."""
@@ -179,8 +178,8 @@ class Transcription:
     @traced_once  # like those below
     def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
         """`node` at every node, and `end`."""
-        if on_host(w.x0):
-            return self._at_points(values, w)
+        if on_numpy(w.x0):
+            return self._at_points(point_values, w)
         over = jax.vmap(jax.vmap(self.functions.node), in_axes=(None, None, 0))
         return over(*self._nodes_and_weights, self.inputs(w)), self.functions.end(
             self.end_inputs(w)
@@ -211,8 +210,7 @@ class Transcription:
         n, rule, dtype = self.problem.n, self.rule, self.dtype
         A, B = xp.asarray(rule.A, dtype), xp.asarray(rule.B, dtype)
         # sum_j D_ij x_j - f(x_i, u_i) on [-1, 1]: review, eq. (21).
-        defect = xp.einsum("rp,spn->srn", A, self.support(w))
-        defect = defect - xp.einsum("rk,skn->srn", B, node[:, :, :n])
+        defect = A @ self.support(w) - B @ node[:, :, :n]
         residual = Equations(defect, node[:, :, n + 1 :] - w.path, end[1:] - w.end)
         # J^N = E + sum_i w_i F_i, the integral by quadrature: review, eqs (2), (15) and (21).
         rough = xp.sum(w.u * self.roughness(w.u)) / 2
@@ -221,8 +219,8 @@ class Transcription:
     @traced_once
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
         """Values and Jacobians, node by node and of the endpoint functions."""
-        if on_host(w.x0):
-            (value, jacobian), end = self._at_points(derivatives, w)
+        if on_numpy(w.x0):
+            (value, jacobian), end = self._at_points(point_derivatives, w)
             return Nodes(value, jacobian), Ends(*end)
         both = lambda f: lambda *a: (f(*a), f(*a))
         node = jax.jacfwd(both(self.functions.node), argnums=2, has_aux=True)
@@ -237,7 +235,7 @@ class Transcription:
         """The factor of each entry of `Nodes.value` in the Lagrangian f + y^T c: -B^T y of the
         dynamics, 1 of the cost, y of the path constraints."""
         B = xp.asarray(self.rule.B, y.defect.dtype)
-        f = -xp.einsum("rk,srn->skn", B, y.defect)
+        f = -(B.T @ y.defect)
         return xp.concatenate([f, xp.ones_like(f[:, :, :1]), y.path], axis=2)
 
     def hessians(
@@ -247,8 +245,8 @@ class Transcription:
         and, of its endpoint part, with respect to `end_inputs`."""
         weights = self.node_weights(y)
         c = xp.concatenate([xp.ones_like(y.end, shape=1), y.end])
-        if on_host(w.x0):
-            return self._at_points(hessians, w, weights, c)
+        if on_numpy(w.x0):
+            return self._at_points(point_hessians, w, weights, c)
         node = lambda tau, w, q, c: jnp.dot(c, self.functions.node(tau, w, q))
         over = jax.vmap(jax.vmap(hessian(node, 2)), in_axes=(None, None, 0, 0))
         at_nodes = over(*self._nodes_and_weights, self.inputs(w), weights)

@@ -1,5 +1,7 @@
 """Sums, largest entries and moves of pytrees of arrays: the vector algebra of the optimiser."""
 
+import functools
+import operator
 from typing import Any
 
 import jax
@@ -12,7 +14,8 @@ _tree = jax.tree_util.tree_map
 
 def total(tree: Any) -> Float[Array, ""]:
     """Sum of all entries; 0 if there are none."""
-    return sum((xp.sum(a) for a in jax.tree_util.tree_leaves(tree)), xp.zeros(()))
+    sums = map(xp.sum, jax.tree_util.tree_leaves(tree))
+    return functools.reduce(operator.add, sums, xp.zeros(()))
 
 
 def largest(tree: Any) -> Float[Array, ""]:

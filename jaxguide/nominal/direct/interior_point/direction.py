@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxguide.arrays import Array, added, loop, on_host, xp
+from jaxguide.arrays import Array, added, loop, on_numpy, xp
 from jaxguide.nominal.direct.box import barrier_gradient
 from jaxguide.nominal.direct.elimination import Segments, eliminate
 from jaxguide.nominal.direct.interior_point.evaluation import Iterate
@@ -119,7 +119,7 @@ def _corrected(
         return xp.where(ok, delta, following), factor, ok
 
     blank = None
-    if not on_host(first):
+    if not on_numpy(first):
         blank = jax.eval_shape(lambda d: factorise_with(d)[0], first)
         blank = jax.tree_util.tree_map(lambda a: xp.zeros(a.shape, a.dtype), blank)
     return loop(lambda a: ~a[2] & (a[0] < _DELTA_MAX), attempt, (first, blank, xp.array(False)))

@@ -4,7 +4,7 @@ import functools
 
 import jax
 
-from jaxguide.arrays import Array, either, loop, on_host, xp
+from jaxguide.arrays import Array, either, loop, on_numpy, xp
 from jaxguide.nominal.direct.box import Box, boxed, distances, inside
 from jaxguide.nominal.direct.interior_point.barrier import MEMORY, barrier_of
 from jaxguide.nominal.direct.interior_point.direction import factorised, gradients_of
@@ -98,7 +98,7 @@ def _advanced(setup: Setup, s: State) -> State:
         numbers = (s.iteration, at.f, largest(at.c), now, new.mu, delta, alpha)
         show = (
             print_iteration
-            if on_host(s.w)
+            if on_numpy(s.w)
             else functools.partial(jax.debug.callback, print_iteration)
         )
         show(s.mode, program.scale.objective, *numbers)
