@@ -4,15 +4,17 @@ multipliers that hold them are complementary."""
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from jaxguide.arrays import Array, xp
 
 
 def bounds_of(bounds: Any, size: int, dtype: Any) -> tuple[Array, Array]:
     """`(lower, upper)` broadcast to `(size,)` each."""
     lower, upper = bounds
     return (
-        jnp.broadcast_to(jnp.asarray(lower, dtype), (size,)),
-        jnp.broadcast_to(jnp.asarray(upper, dtype), (size,)),
+        xp.broadcast_to(xp.asarray(lower, dtype), (size,)),
+        xp.broadcast_to(xp.asarray(upper, dtype), (size,)),
     )
 
 
@@ -21,7 +23,7 @@ def joined_bounds(bounds: Any, size: int, more: Any, further: int) -> tuple[Arra
     for."""
     parts = (bounds_of(b, k, jnp.result_type(float)) for b, k in ((bounds, size), (more, further)))
     lower, upper = zip(*parts, strict=True)
-    return jnp.concatenate(lower), jnp.concatenate(upper)
+    return xp.concatenate(lower), xp.concatenate(upper)
 
 
 def overstep(values: Float[Array, "*k c"], bounds: Any) -> Float[Array, "*k c"]:

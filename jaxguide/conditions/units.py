@@ -4,9 +4,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, on_numpy, padded_to_ladder, traced_once, xp
 from jaxguide.bounds import bounds_of
+from jaxguide.host.compilation import compiled
 from jaxguide.problem import Problem, with_parameters
 
 # A value below it is at rest at zero: the square root of rounding, in the user's unit. Chosen, not
@@ -23,13 +25,13 @@ def known_size(
 ) -> Float[Array, " n"]:
     """The larger of two finite bounds; otherwise the largest of the `seen` values, unless it is at
     rest; otherwise 0."""
-    bounded = jnp.isfinite(lo) & jnp.isfinite(hi)
-    wide = jnp.where(bounded, jnp.maximum(jnp.abs(lo), jnp.abs(hi)), 0.0)
-    largest = jnp.max(jnp.abs(seen), axis=0)
-    return jnp.where(wide > 0, wide, jnp.where(largest > REST, largest, 0.0))
+    bounded = xp.isfinite(lo) & xp.isfinite(hi)
+    wide = xp.where(bounded, xp.maximum(xp.abs(lo), xp.abs(hi)), 0.0)
+    largest = xp.max(xp.abs(seen), axis=0)
+    return xp.where(wide > 0, wide, xp.where(largest > REST, largest, 0.0))
 
 
-@jax.jit
+@traced_once
 def natural_units(
     problem: Problem,
     times: Float[Array, " clock"],
@@ -50,25 +52,30 @@ def natural_units(
     problem.
     """
     n, m, dtype = problem.n, problem.m, x.dtype
-    seen = jnp.concatenate([x0[None], x.reshape(-1, n)])
+    seen = xp.concatenate([x0[None], x.reshape(-1, n)])
     x_size = known_size(*bounds_of(problem.state_bounds, n, dtype), seen)
-    u_size = known_size(*bounds_of(problem.control_bounds, m, dtype), jnp.zeros((1, m), dtype))
-    known = jnp.concatenate([x_size, u_size])
+    u_size = known_size(*bounds_of(problem.control_bounds, m, dtype), xp.zeros((1, m), dtype))
+    known = xp.concatenate([x_size, u_size])
     # Small numbers alone are better than nothing.
-    small = jnp.concatenate([jnp.max(jnp.abs(seen), axis=0), jnp.zeros(m, dtype)])
-    known = jnp.where(jnp.any(known > 0), known, small)
+    small = xp.concatenate([xp.max(xp.abs(seen), axis=0), xp.zeros(m, dtype)])
+    known = xp.where(xp.any(known > 0), known, small)
     moves = _moves(problem, times, x0, x, u)
 
     def spread(_: Any, size: Array) -> Array:
-        mover = jnp.where((size[:n, None] > 0) & (moves > 0), size[:n, None] / moves, jnp.inf)
-        mover = jnp.min(mover, axis=0)
-        moved = jnp.pad(jnp.max(moves * size[None], axis=1), (0, m))
-        estimate = jnp.where(jnp.isfinite(mover), mover, moved)
-        return jnp.where(size > 0, size, estimate)
+        mover = xp.where((size[:n, None] > 0) & (moves > 0), size[:n, None] / moves, xp.inf)
+        mover = xp.min(mover, axis=0)
+        moved = xp.pad(xp.max(moves * size[None], axis=1), (0, m))
+        estimate = xp.where(xp.isfinite(mover), mover, moved)
+        return xp.where(size > 0, size, estimate)
 
-    estimate = jax.lax.fori_loop(0, n + m, spread, known)
-    far = (estimate > 0) & (jnp.abs(jnp.log10(jnp.where(estimate > 0, estimate, 1.0))) > _FAR)
-    size = jnp.where(known > 0, known, jnp.where(far, estimate, 1.0))
+    estimate = known
+    if on_numpy(known):
+        for _ in range(n + m):
+            estimate = spread(None, estimate)
+    else:
+        estimate = jax.lax.fori_loop(0, n + m, spread, known)
+    far = (estimate > 0) & (xp.abs(xp.log10(xp.where(estimate > 0, estimate, 1.0))) > _FAR)
+    size = xp.where(known > 0, known, xp.where(far, estimate, 1.0))
     return size[:n], size[n:]
 
 
@@ -77,9 +84,20 @@ def _moves(
 ) -> Float[Array, "n unknown"]:
     """By how much a unit of each state and control moves each state within the horizon: the largest
     slope of the dynamics at the start and at the segments' ends."""
-    rate = jax.jacfwd(with_parameters(problem, None).dynamics, argnums=(1, 2))
-    at = jnp.concatenate(rate(times[0], x0, u[0, 0]), axis=1)[None]
-    ends = jax.vmap(rate, in_axes=(None, 0, 0))((times[0] + times[1]) / 2, x[:, -1], u[:, -1])
-    moves = jnp.concatenate([at, jnp.concatenate(ends, axis=2)])
-    moves = jnp.max(jnp.where(jnp.isfinite(moves), jnp.abs(moves), 0.0), axis=0)
+    t, middle = times[0], (times[0] + times[1]) / 2
+    along = (xp.broadcast_to(middle, (len(x),)), x[:, -1], u[:, -1])
+    first = (t[None], x0[None], u[:1, 0])
+    points = [xp.concatenate(pair) for pair in zip(first, along, strict=True)]
+    if on_numpy(*points):
+        padded = map(padded_to_ladder, points)
+        moves = jax.device_get(compiled(_slopes, True)(problem, *padded))[: len(points[0])]
+    else:
+        moves = _slopes(problem, *points)
+    moves = xp.max(xp.where(xp.isfinite(moves), xp.abs(moves), 0.0), axis=0)
     return moves * (times[1] - times[0])
+
+
+def _slopes(problem: Problem, t: Array, x: Array, u: Array) -> Float[Array, "point n unknown"]:
+    """Slopes of the dynamics by states and controls."""
+    rate = jax.jacfwd(with_parameters(problem, None).dynamics, argnums=(1, 2))
+    return jnp.concatenate(jax.vmap(rate)(t, x, u), axis=2)

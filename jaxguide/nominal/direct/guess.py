@@ -1,12 +1,14 @@
 """The guess that a direct solve starts from: straight, random or from an extremal."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jaxguide.arrays import Array, added, on_numpy, xp
 from jaxguide.bounds import bounds_of
 from jaxguide.conditions.units import REST, natural_units
 from jaxguide.nominal.direct.transcription import Transcription
@@ -22,7 +24,8 @@ from jaxguide.problem import (
     start_value,
     with_parameters,
 )
-from jaxguide.trajectory import Extremal
+from jaxguide.spectral.grids import evaluation
+from jaxguide.trajectory import Extremal, Point
 from jaxguide.transforms.endless import evened
 
 # Constant controls that are tried where states rest: distances from the middle of a control's
@@ -43,8 +46,8 @@ def edges(fractions: Float[Array, " edge"], knots: tuple[int, ...]) -> Float[Arr
     left = np.clip(np.searchsorted(main, j, side="right") - 1, 0, len(main) - 2)
     a, b = fractions[main[left]], fractions[main[left + 1]]
     share = (fractions - a) / (b - a)
-    out = jnp.zeros((last + 1, 2 + len(knots)), fractions.dtype)
-    return out.at[j, column[left]].add(1 - share).at[j, column[left + 1]].add(share)
+    out = np.zeros((last + 1, 2 + len(knots)), fractions.dtype)
+    return added(added(out, (j, column[left]), 1 - share), (j, column[left + 1]), share)
 
 
 def straight_guess(
@@ -152,7 +155,7 @@ def random_guess(
 def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Float[Array, " k"]:
     """t0, tf and the knots, at their fractions of the horizon."""
     inner = t0 + (tf - t0) * fractions[np.array(sorted(knots), int)]
-    return jnp.concatenate([jnp.stack([t0, tf]), inner])
+    return xp.concatenate([xp.stack([t0, tf]), inner])
 
 
 def without_slacks(
@@ -160,15 +163,15 @@ def without_slacks(
 ) -> Primal:
     """A guess whose slacks are zero, to be set from the constraints' values."""
     counts, dtype = program.counts, program.dtype
-    p_ = jnp.stack([jnp.asarray(v, dtype) for v in p]) if p else jnp.zeros(0, dtype)
-    path = jnp.zeros((counts.segments, counts.nodes, counts.path), dtype)
-    return Primal(x0, x, u, times, p_, path, jnp.zeros(counts.end, dtype))
+    p_ = xp.stack([xp.asarray(v, dtype) for v in p]) if p else xp.zeros(0, dtype)
+    path = xp.zeros((counts.segments, counts.nodes, counts.path), dtype)
+    return Primal(x0, x, u, times, p_, path, xp.zeros(counts.end, dtype))
 
 
 def fractions_at(fractions: Float[Array, " edge"], tau: np.ndarray) -> Float[Array, "segment k"]:
     """The points `tau` of every segment, as fractions of the horizon."""
-    local = jnp.asarray((tau[None] + 1) / 2, fractions.dtype)
-    return fractions[:-1, None] + jnp.diff(fractions)[:, None] * local
+    local = xp.asarray((tau[None] + 1) / 2, fractions.dtype)
+    return fractions[:-1, None] + xp.diff(fractions)[:, None] * local
 
 
 def from_extremal(
@@ -182,12 +185,43 @@ def from_extremal(
     counts, rule, dtype = program.counts, program.rule, program.dtype
     t0, tf = guess.t[0], guess.t[-1]
     at = lambda tau: t0 + (tf - t0) * fractions_at(fractions, tau)
-    fill = lambda y, k: jnp.concatenate(
-        [y, jnp.zeros((*y.shape[:-1], k - y.shape[-1]), dtype)], axis=-1
+    fill = lambda y, k: xp.concatenate(
+        [y, xp.zeros((*y.shape[:-1], k - y.shape[-1]), dtype)], axis=-1
     )
-    point = jax.vmap(jax.vmap(guess.point))
-    x = fill(point(at(rule.support[1:])).x, counts.n)
-    u = fill(point(at(rule.nodes)).u, counts.m)
+    x = fill(points_of(guess, at(rule.support[1:])).x, counts.n)
+    u = fill(points_of(guess, at(rule.nodes)).u, counts.m)
     p = [start_value(v) for v in parameters(guess.problem, like=problem)]
     times = placed(t0, tf, fractions, knots)
     return without_slacks(program, fill(guess.x[0], counts.n), x, u, times, p)
+
+
+def points_of(guess: Extremal, times: Float[Array, "segment k"]) -> Point:
+    """`Extremal.point` at many times."""
+    if not on_numpy(guess.t, times):
+        return jax.vmap(jax.vmap(guess.point))(times)
+    values = np.concatenate([guess.x, guess.u, guess.costate], axis=1)
+    before = None
+    if guess.u_before is not None:
+        ends = values[guess.degree :: guess.degree, : guess.x.shape[1]]
+        before = np.concatenate([ends, guess.u_before, guess.costate_before], axis=1)
+    found = interpolated(guess, values, times, before)
+    return Point(*np.split(found, np.cumsum([guess.x.shape[1], guess.u.shape[1]]), axis=2))
+
+
+def interpolated(
+    guess: Extremal, values: Array, times: Float[Array, "segment k"], before: Any = None
+) -> Float[Array, "segment k c"]:
+    """`Extremal.interpolate` of nodal `values` at many times; `before`: the values just before the
+    breaks, where they jump there."""
+    if not on_numpy(values, times):
+        return jax.vmap(jax.vmap(lambda t: guess.interpolate(values, t)))(times)
+    p = len(guess.reference_nodes)
+    breaks = guess.t[:: p - 1]
+    parts = values[np.arange(len(breaks) - 1)[:, None] * (p - 1) + np.arange(p)]
+    if before is not None:
+        parts[:, -1] = before
+    t = np.clip(times.reshape(-1), breaks[0], breaks[-1])
+    s = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
+    a, b = breaks[s], breaks[s + 1]
+    rows = evaluation(guess.reference_nodes, (2 * t - a - b) / np.where(b > a, b - a, 1.0))
+    return (rows[:, None] @ parts[s])[:, 0].reshape(*times.shape, -1)

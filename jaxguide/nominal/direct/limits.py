@@ -4,12 +4,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
 
+from jaxguide.arrays import Array, on_numpy, traced_once, xp
 from jaxguide.bounds import bounds_of
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
-from jaxguide.problem import initial_bounds, initial_values, initially_free, is_free, parameters
+from jaxguide.problem import (
+    Problem,
+    count,
+    endpoint_count,
+    initial_bounds,
+    initial_values,
+    initially_free,
+    is_free,
+    parameters,
+)
 
 # Least distance of successive free knots, as a share of the horizon's unit. Chosen, not tuned: far
 # below any arc that matters, far above the rounding of times.
@@ -25,25 +35,16 @@ class Limits(NamedTuple):
     hi: Primal
 
 
-@jax.jit
+@traced_once
 def limits_of(program: Transcription) -> Limits:
     """Bounds of the unknowns, scaled. Given entries of `x0`, `times` and `p` have both equal."""
-    problem, scale, counts = program.problem, program.scale, program.counts
-    dtype = program.dtype
-    over = lambda b, *lead: jnp.broadcast_to(b, (*lead, *b.shape))
-
-    states = bounds_of(problem.state_bounds, counts.n, dtype)
-    start, free = initial_values(problem, dtype), jnp.asarray(initially_free(problem))
-    x0 = [jnp.where(free, side, start) for side in initial_bounds(problem)]
-    times = _time_bounds(program)
-    p = [_entry_bounds(v, dtype) for v in parameters(problem)]
-    controls = bounds_of(problem.control_bounds, counts.m, dtype)
-    path = bounds_of(problem.path_bounds, counts.path, dtype)
-    end = bounds_of(problem.endpoint_bounds, counts.end - len(program.order), dtype)
-    apart = (
-        jnp.full(len(program.order), _APART, dtype),
-        jnp.full(len(program.order), jnp.inf, dtype),
-    )
+    scale, counts, dtype = program.scale, program.counts, program.dtype
+    over = lambda b, *lead: xp.broadcast_to(b, (*lead, *b.shape))
+    own = _own_bounds
+    if on_numpy(program.edges):
+        own = lambda *a: jax.device_get(_own_bounds_program(*a))
+    x0, states, controls, times, p, path, end = own(program.problem, counts.times)
+    apart = [np.full(len(program.order), v, dtype) for v in (_APART, np.inf)]
 
     u = [over(b / scale.u, counts.segments, counts.nodes) for b in controls]
     x = [over(b / scale.x, counts.segments, counts.after) for b in states]
@@ -56,13 +57,41 @@ def limits_of(program: Transcription) -> Limits:
             x0[i] / scale.x,
             x[i],
             u[i],
-            jnp.stack([t[i] for t in times]) / scale.t,
-            (jnp.stack([v[i] for v in p]) if p else jnp.zeros(0, dtype)) / scale.p,
+            times[i] / scale.t,
+            p[i] / scale.p,
             h[i],
-            jnp.concatenate([end[i] / scale.end[: len(end[i])], apart[i]]),
+            xp.concatenate([end[i] / scale.end[: len(end[i])], apart[i]]),
         )
 
     return Limits(side(0), side(1))
+
+
+_Sides = tuple[_Side, ...]
+
+
+def _own_bounds(problem: Problem, clocks: int) -> _Sides:
+    """Bounds in user units, of whatever mesh: of the initial state, states, controls, times,
+    parameters, path and endpoint constraints."""
+    dtype, n = jnp.result_type(float), problem.n
+    start, free = initial_values(problem, dtype), jnp.asarray(initially_free(problem))
+    x0 = tuple(jnp.where(free, side, start) for side in initial_bounds(problem))
+    times = _time_bounds(problem, clocks)
+    p = [_entry_bounds(v, dtype) for v in parameters(problem)]
+    pair = lambda sides: tuple(
+        jnp.stack([s[i] for s in sides]) if sides else jnp.zeros(0, dtype) for i in (0, 1)
+    )
+    return (
+        x0,
+        bounds_of(problem.state_bounds, n, dtype),
+        bounds_of(problem.control_bounds, problem.m, dtype),
+        pair(times),
+        pair(p),
+        bounds_of(problem.path_bounds, count(problem, "path_constraints"), dtype),
+        bounds_of(problem.endpoint_bounds, endpoint_count(problem), dtype),
+    )
+
+
+_own_bounds_program = jax.jit(_own_bounds, static_argnums=1)
 
 
 def _entry_bounds(entry: Any, dtype: Any) -> _Side:
@@ -73,17 +102,17 @@ def _entry_bounds(entry: Any, dtype: Any) -> _Side:
     return number(entry), number(entry)
 
 
-def _time_bounds(program: Transcription) -> list[_Side]:
+def _time_bounds(problem: Problem, clocks: int) -> list[_Side]:
     """Bounds of t0, tf and the free knots, in user units. The end may not precede a given start,
     nor a free start follow a given end."""
-    problem, dtype = program.problem, program.dtype
+    dtype = jnp.result_type(float)
     number = lambda v: jnp.asarray(v, dtype)
     times = [_entry_bounds(t, dtype) for t in (problem.initial_time, problem.final_time)]
     if is_free(problem.final_time) and not is_free(problem.initial_time):
         times[1] = (jnp.maximum(times[1][0], times[0][0]), times[1][1])
     if is_free(problem.initial_time) and not is_free(problem.final_time):
         times[0] = (times[0][0], jnp.minimum(times[0][1], times[1][0]))
-    return times + [(number(-jnp.inf), number(jnp.inf))] * (program.counts.times - 2)
+    return times + [(number(-jnp.inf), number(jnp.inf))] * (clocks - 2)
 
 
 def _on_arcs(
@@ -93,10 +122,10 @@ def _on_arcs(
     states and path constraints that they determine are unbounded."""
     assert program.arcwise is not None
     at = program.arcwise.held[:, None]
-    u = [jnp.where(at > 0, u[1], u[0]), jnp.where(at < 0, u[0], u[1])]
-    inner, last = jnp.split(program.arcwise.released, 2, axis=1)
-    free = jnp.concatenate([jnp.repeat(inner, program.counts.after - 1, axis=1), last], axis=1)
-    x = [jnp.where(free, side, b) for side, b in zip((-jnp.inf, jnp.inf), x, strict=True)]
+    u = [xp.where(at > 0, u[1], u[0]), xp.where(at < 0, u[0], u[1])]
+    inner, last = xp.split(program.arcwise.released, 2, axis=1)
+    free = xp.concatenate([xp.repeat(inner, program.counts.after - 1, axis=1), last], axis=1)
+    x = [xp.where(free, side, b) for side, b in zip((-xp.inf, xp.inf), x, strict=True)]
     free = program.arcwise.unpathed[:, None]
-    h = [jnp.where(free, side, b) for side, b in zip((-jnp.inf, jnp.inf), h, strict=True)]
+    h = [xp.where(free, side, b) for side, b in zip((-xp.inf, xp.inf), h, strict=True)]
     return x, u, h

@@ -4,14 +4,16 @@
 """
 
 import dataclasses
+import operator
+import time
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from jaxguide.arrays import Array, on_numpy, xp
 from jaxguide.host.compilation import without_collection
 from jaxguide.host.lapack import single_threaded_lapack
 from jaxguide.host.memory import physical_memory
@@ -201,17 +203,22 @@ class Pseudospectral(Method):
         return dataclasses.replace(extremal, result=result)
 
     def run(self, problem: Problem, guess: Any) -> Extremal:
-        """In two programs, so that the optimiser's serves every guess and every mesh of its size.
-        What the host may refine is not judged here."""
+        """On the host with NumPy, which compiles the Problem's functions alone; once a program of
+        this size has taken there as long as compiling it would, compiled. What the host may refine
+        is not judged here."""
         if self.log:
             units = self.units(problem, guess).items()
             print("designer units: " + ", ".join(f"{k} {v:.4g}" for k, v in units))
         with without_collection(), np.errstate(all="ignore"):
-            prepared = jax.device_get(_prepared(self, problem, guess))
-            program, start, options = prepared
-            limits = jax.device_get(limits_of(program))
-            solution = interior_point.minimise(program, limits, start, options)
-            return to_extremal(jax.device_get(problem), program, limits, solution)
+            near = guess if isinstance(guess, Extremal) else None
+            method, stated, near = jax.device_get((self, problem, near))
+            if near is None:
+                program, start, options = jax.device_get(_prepared(self, problem, guess))
+            else:
+                program, start, options = method.prepared(stated, near)
+            limits = limits_of(program)
+            solution = _minimised(program, limits, start, options, self.quick)
+            return to_extremal(stated, program, limits, solution)
 
     def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
         """Designer units: what the solver takes for one of each state, control, time, constraint
@@ -236,20 +243,20 @@ class Pseudospectral(Method):
         whole = with_integrals(problem)
         if not np.any(np.asarray(self.relaxation)):
             return whole
-        delta = jnp.broadcast_to(jnp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
-        return relaxed(whole, jnp.pad(delta, (0, whole.n - problem.n)))
+        delta = xp.broadcast_to(xp.asarray(self.relaxation, jnp.result_type(float)), (problem.n,))
+        return relaxed(whole, xp.pad(delta, (0, whole.n - problem.n)))
 
     def _arcwise(self, problem: Problem, whole: Problem, segments: int) -> Arcwise | None:
         """`arcwise`, `smoothing` added, with entries for what `whole` has besides."""
         known = self.arcwise
         if np.any(np.asarray(self.smoothing)):
             known = Arcwise.blank(segments, problem) if known is None else known
-            weights = jnp.asarray(self.smoothing, jnp.result_type(float))
-            weights = known.smooth + jnp.broadcast_to(weights, (problem.m,))[None]
-            known = eqx.tree_at(lambda a: a.smooth, known, weights)
+            weights = xp.asarray(self.smoothing, jnp.result_type(float))
+            weights = known.smooth + xp.broadcast_to(weights, (problem.m,))[None]
+            known = dataclasses.replace(known, smooth=weights)
         if known is None:
             return None
-        more = lambda a, k: jnp.pad(a, (*((0, 0),) * (a.ndim - 1), (0, k - a.shape[-1])))
+        more = lambda a, k: xp.pad(a, (*((0, 0),) * (a.ndim - 1), (0, k - a.shape[-1])))
         return Arcwise(
             more(known.held, whole.m),
             more(known.smooth, whole.m),
@@ -264,12 +271,13 @@ class Pseudospectral(Method):
         single_threaded_lapack()
         dtype = jnp.result_type(float)
         # Where the search starts does not matter to the solution; where the breaks are, does.
-        problem = jax.lax.stop_gradient(problem)
+        still = lambda a: a if on_numpy(a) else jax.lax.stop_gradient(a)
+        problem = jax.tree_util.tree_map(still, problem)
         whole = self.whole(problem)
         if self.fractions is None:
-            fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
+            fractions = np.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
         else:
-            fractions = jnp.asarray(self.fractions, dtype)
+            fractions = xp.asarray(self.fractions, dtype)
         unit = unit_scale(whole, len(self.knots))
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
@@ -284,8 +292,8 @@ class Pseudospectral(Method):
         else:
             w = from_extremal(program, fractions, self.knots, problem, guess)
         scale = designer_units(program, w)
-        program = eqx.tree_at(lambda p: p.scale, program, scale)
-        w = jax.tree_util.tree_map(jnp.divide, w, program.units)
+        program = dataclasses.replace(program, scale=scale)
+        w = jax.tree_util.tree_map(operator.truediv, w, program.units)
         node, end = program.values(w)
         w = w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
         start = interior_point.Start(w, *blank_duals(program, w))
@@ -297,9 +305,9 @@ class Pseudospectral(Method):
                 start, warm = start._replace(**duals(program, fractions, w, guess)), True
                 mu, push = 1e-6, 1e-6
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
-        still, start = jax.lax.stop_gradient((program, start))
-        program = eqx.tree_at(lambda p: p.edges, still, program.edges)
-        return program, start, jax.tree_util.tree_map(jnp.asarray, options)
+        unmoved, start = jax.tree_util.tree_map(still, (program, start))
+        program = dataclasses.replace(unmoved, edges=program.edges)
+        return program, start, jax.tree_util.tree_map(xp.asarray, options)
 
 
 def finished(
@@ -325,6 +333,34 @@ def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
 @eqx.filter_jit
 def _scale(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
     return method.prepared(problem, guess)[0].scale
+
+
+# Seconds that programs of each size have taken on the host, and those after which one is compiled:
+# about what compiling takes, so that whoever solves once or a thousand times waits at most twice as
+# long as was needed.
+_on_host_so_far: dict[Any, float] = {}
+_WORTH_COMPILING = 8.0
+
+
+def _minimised(
+    program: Transcription,
+    limits: Limits,
+    start: interior_point.Start,
+    options: interior_point.Options,
+    quick: bool,
+) -> interior_point.Solution:
+    """`interior_point.minimise` by NumPy, or compiled where that is worth it: at once if `quick` is
+    False."""
+    leaves, structure = jax.tree_util.tree_flatten((program, start))
+    size = (structure, *map(np.shape, leaves))
+    spent = _on_host_so_far.get(size, 0.0)
+    if not quick or spent > _WORTH_COMPILING:
+        given = jax.device_put((program, limits, start, options))
+        return jax.device_get(compiled(interior_point.minimise, quick)(*given))
+    began = time.perf_counter()
+    solution = interior_point.minimise(program, limits, start, options)
+    _on_host_so_far[size] = spent + time.perf_counter() - began
+    return solution
 
 
 @jax.custom_batching.sequential_vmap

@@ -191,8 +191,13 @@ class Transcription:
         does."""
         if self.arcwise is None:
             return xp.zeros_like(u)
+        return xp.einsum("sm,ij,sjm...->sim...", self.arcwise.smooth, self._upper_squares, u)
+
+    @functools.cached_property
+    def _upper_squares(self) -> Float[np.ndarray, "node node"]:
+        """The sum of squares of the upper half of the Legendre coefficients, of values at nodes."""
         upper = legendre(self.rule.nodes)[self.points // 2 :]
-        return xp.einsum("sm,ij,sjm...->sim...", self.arcwise.smooth, upper.T @ upper, u)
+        return upper.T @ upper
 
     @traced_once
     def objective_and_residual(

@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxguide.nominal.direct.guess import fractions_at
+from jaxguide.arrays import Array, put, xp
+from jaxguide.nominal.direct.guess import fractions_at, interpolated, points_of
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.trees import zeros_like
 from jaxguide.nominal.direct.unknowns import Equations, Primal
@@ -18,7 +17,7 @@ def blank_duals(program: Transcription, w: Primal) -> tuple[Equations, Primal]:
     """Multipliers of zero: of the constraints, and net ones of the bounds."""
     counts = program.counts
     rows = program.rule.A.shape[0]
-    defect = jnp.zeros((counts.segments, rows, counts.n), program.dtype)
+    defect = xp.zeros((counts.segments, rows, counts.n), program.dtype)
     zeros = zeros_like(w)
     return Equations(defect, zeros.path, zeros.end), zeros
 
@@ -49,20 +48,20 @@ def duals(
     defect = _defect_multipliers(program, guess, times)
 
     # Multipliers along the nodes are densities in time: times the weight and dt/dtau.
-    weight = jnp.asarray(rule.w, dtype)[None, :, None]
+    weight = xp.asarray(rule.w, dtype)[None, :, None]
     spans = program.clocks @ w.times
     clock = weight * ((spans[:, 1] - spans[:, 0]) / 2)[:, None, None] * scale.t / scale.objective
-    held = jnp.concatenate([m.path, m.state, m.control], axis=1)
-    held = jax.vmap(jax.vmap(lambda t: guess.interpolate(held, t)))(times[:, :-1])
-    path, state, control = jnp.split(held, np.cumsum([m.path.shape[1], m.state.shape[1]]), axis=2)
-    wide = lambda a, k: jnp.pad(a, ((0, 0), (0, 0), (0, k - a.shape[2])))
+    held = xp.concatenate([m.path, m.state, m.control], axis=1)
+    held = interpolated(guess, held, times[:, :-1])
+    path, state, control = xp.split(held, np.cumsum([m.path.shape[1], m.state.shape[1]]), axis=2)
+    wide = lambda a, k: xp.pad(a, ((0, 0), (0, 0), (0, k - a.shape[2])))
     path = path * clock * scale.path[None, None]
-    end = jnp.concatenate([m.endpoint, r]) / scale.objective
-    end = jnp.pad(end, (0, counts.end - end.shape[0])) * scale.end
-    on_states = jnp.zeros_like(w.x)
+    end = xp.concatenate([m.endpoint, r]) / scale.objective
+    end = xp.pad(end, (0, counts.end - end.shape[0])) * scale.end
+    on_states = xp.zeros_like(w.x)
     first = 1 - rule.first  # the first node that follows the segment's start
     state = wide(state, counts.n) * clock * scale.x[None, None]
-    on_states = on_states.at[:, : counts.nodes - first].set(state[:, first:])
+    on_states = put(on_states, np.s_[:, : counts.nodes - first], state[:, first:])
     net = zeros_like(w)._replace(
         x=on_states, u=wide(control, counts.m) * clock * scale.u[None, None], path=path, end=end
     )
@@ -75,12 +74,12 @@ def _defect_multipliers(
     """-w lambda at the nodes: review (2012), Remark 3; `times` of the nodes and of the ends."""
     counts, rule, scale, dtype = program.counts, program.rule, program.scale, program.dtype
     r = guess.multipliers.integral
-    costate = jax.vmap(jax.vmap(guess.point))(times).costate
+    costate = points_of(guess, times).costate
     # The costate of an integral is its multiplier, constant in time.
-    constant = jnp.broadcast_to(r, (*costate.shape[:2], r.shape[0]))
-    lam = jnp.concatenate([costate, constant], axis=2) * (scale.x / scale.objective)[None, None]
-    weight = jnp.asarray(rule.w, dtype)[None, :, None]
+    constant = xp.broadcast_to(r, (*costate.shape[:2], r.shape[0]))
+    lam = xp.concatenate([costate, constant], axis=2) * (scale.x / scale.objective)[None, None]
+    weight = xp.asarray(rule.w, dtype)[None, :, None]
     nodal, end = lam[:, :-1], lam[:, -1:]
     if rule.A.shape[0] > counts.nodes:  # LG: the last row is the quadrature to the end
-        return jnp.concatenate([-weight * (nodal - end), -end], axis=1)
+        return xp.concatenate([-weight * (nodal - end), -end], axis=1)
     return -weight * nodal
