@@ -162,7 +162,7 @@ def solve_triangular(
     return x if info == 0 else np.full_like(x, np.nan)
 
 
-def pivoted_lu(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pivoted_lu(a: Any) -> tuple[Any, Any]:
     """L and U of each matrix of the host, in one array, and the order of rows by pivoting."""
     if a.ndim > 2:
         lu, order = zip(*map(pivoted_lu, a), strict=True)

@@ -170,7 +170,7 @@ def _lu_with_order(
     finds it from LAPACK's exchanges one by one, which took longer than the factorisation.
     """
     if on_numpy(a):
-        return pivoted_lu(a)  # pyright: ignore[reportReturnType]
+        return pivoted_lu(a)
     rows, columns = a.shape
     numbers = xp.arange(rows, dtype=a.dtype)[:, None]
     lu = jax.lax.linalg.lu(xp.concatenate([a, numbers], axis=1))[0]

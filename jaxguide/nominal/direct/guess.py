@@ -199,13 +199,13 @@ def points_of(guess: Extremal, times: Float[Array, "segment k"]) -> Point:
     """`Extremal.point` at many times."""
     if not on_numpy(guess.t, times):
         return jax.vmap(jax.vmap(guess.point))(times)
-    values = np.concatenate([guess.x, guess.u, guess.costate], axis=1)
+    values = xp.concatenate([guess.x, guess.u, guess.costate], axis=1)
     before = None
-    if guess.u_before is not None:
+    if guess.u_before is not None and guess.costate_before is not None:
         ends = values[guess.degree :: guess.degree, : guess.x.shape[1]]
-        before = np.concatenate([ends, guess.u_before, guess.costate_before], axis=1)
+        before = xp.concatenate([ends, guess.u_before, guess.costate_before], axis=1)
     found = interpolated(guess, values, times, before)
-    return Point(*np.split(found, np.cumsum([guess.x.shape[1], guess.u.shape[1]]), axis=2))
+    return Point(*xp.split(found, np.cumsum([guess.x.shape[1], guess.u.shape[1]]), axis=2))
 
 
 def interpolated(
@@ -220,8 +220,10 @@ def interpolated(
     parts = values[np.arange(len(breaks) - 1)[:, None] * (p - 1) + np.arange(p)]
     if before is not None:
         parts[:, -1] = before
-    t = np.clip(times.reshape(-1), breaks[0], breaks[-1])
-    s = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
+    t = xp.clip(times.reshape(-1), breaks[0], breaks[-1])
+    s = xp.clip(xp.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
     a, b = breaks[s], breaks[s + 1]
-    rows = evaluation(guess.reference_nodes, (2 * t - a - b) / np.where(b > a, b - a, 1.0))
+    rows: Any = evaluation(
+        np.asarray(guess.reference_nodes), (2 * t - a - b) / np.where(b > a, b - a, 1.0)
+    )
     return (rows[:, None] @ parts[s])[:, 0].reshape(*times.shape, -1)

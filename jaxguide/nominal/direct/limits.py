@@ -66,10 +66,7 @@ def limits_of(program: Transcription) -> Limits:
     return Limits(side(0), side(1))
 
 
-_Sides = tuple[_Side, ...]
-
-
-def _own_bounds(problem: Problem, clocks: int) -> _Sides:
+def _own_bounds(problem: Problem, clocks: int) -> Any:
     """Bounds in user units, of whatever mesh: of the initial state, states, controls, times,
     parameters, path and endpoint constraints."""
     dtype, n = jnp.result_type(float), problem.n

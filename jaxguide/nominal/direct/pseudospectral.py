@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.arrays import Array, on_numpy, xp
-from jaxguide.host.compilation import without_collection
+from jaxguide.host.compilation import compiled, without_collection
 from jaxguide.host.lapack import single_threaded_lapack
 from jaxguide.host.memory import physical_memory
 from jaxguide.nominal.defects import segment_errors
@@ -275,7 +275,7 @@ class Pseudospectral(Method):
         problem = jax.tree_util.tree_map(still, problem)
         whole = self.whole(problem)
         if self.fractions is None:
-            fractions = np.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
+            fractions = xp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
         else:
             fractions = xp.asarray(self.fractions, dtype)
         unit = unit_scale(whole, len(self.knots))

@@ -19,8 +19,8 @@ def unit_scale(problem: Problem, knots: int) -> Scale:
     """User units as they are: every scale 1, of a `problem` with so many free `knots`."""
     path, end = count(problem, "path_constraints"), endpoint_count(problem)
     end += len(clock_order(problem, 2 + knots))
-    one = np.ones((), jnp.result_type(float))
-    many = lambda k: np.ones(k, one.dtype)
+    one = xp.ones((), jnp.result_type(float))
+    many = lambda k: xp.ones(k, one.dtype)
     return Scale(
         many(problem.n), many(problem.m), one, many(len(parameters(problem))), many(path),
         many(end), one,

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from jaxguide.arrays import Array, xp
@@ -98,8 +97,8 @@ class Arcwise(eqx.Module):
     @classmethod
     def blank(cls, segments: int, problem: Problem) -> "Arcwise":
         """Nothing known of any of `segments` arcs of `problem`."""
-        zero = np.zeros((segments, problem.m), jnp.result_type(float))
-        released = np.zeros((segments, 2, problem.n), bool)
+        zero = xp.zeros((segments, problem.m), jnp.result_type(float))
+        released = xp.zeros((segments, 2, problem.n), bool)
         return cls(
-            zero, zero, released, np.zeros((segments, count(problem, "path_constraints")), bool)
+            zero, zero, released, xp.zeros((segments, count(problem, "path_constraints")), bool)
         )
