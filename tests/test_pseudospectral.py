@@ -20,6 +20,7 @@ from jaxguide.nominal.direct.kkt_factor import factorise
 from jaxguide.nominal.direct.kkt_step import newton_step
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Equations, Primal, Scale
+from jaxguide.problem import with_array_leaves
 from jaxguide.problems import EarthMars
 from jaxguide.spectral import FAMILIES
 
@@ -412,6 +413,40 @@ def test_controls_between_nodes_keep_to_what_holds_them(problem, over):
     np.testing.assert_allclose(u[:, 1], 1e-4, atol=1e-6)
     with pytest.raises(ValueError, match="integral constraints"):
         jg.linearize(e, jnp.array([0.1]))
+
+
+class Walled(FreeTime):
+    """A free end, a wall and a bounded control, on knots."""
+
+    state_bounds = ((-jnp.inf, -jnp.inf), (jnp.inf, 0.7))
+    control_bounds = (-1.5, 1.5)
+
+
+ONE_MESH = jg.Pseudospectral(nodes=5, segments=4, refinements=0)
+
+
+@pytest.mark.parametrize(
+    ("problem", "method"),
+    [
+        (Walled(), dataclasses.replace(ONE_MESH, knots=(1, 3))),
+        slow(HeldByPath(), ONE_MESH),
+        slow(Endless(), dataclasses.replace(ONE_MESH, time_scale=2.0)),
+        slow(FreeTime(), dataclasses.replace(ONE_MESH, grid="lgl", smoothing=0.1)),
+        slow(DoubleIntegrator(k=jg.Free(0.5, 2.0)), dataclasses.replace(ONE_MESH, relaxation=1e-3)),
+    ],
+    ids=["knots", "path", "endless", "smoothed", "relaxed"],
+)
+def test_on_the_host_and_compiled(problem, method):
+    """NumPy's engine and XLA's take the same steps, from a guess and from none."""
+    problem = with_array_leaves(problem)
+    whole = jax.jit(lambda p, g: jg.solve(p, method, g, throw=False))
+    host, traced = jg.solve(problem, method), whole(problem, None)
+    for a, b in ((host, traced), (jg.solve(problem, method, host), whole(problem, host))):
+        assert bool(a.result == b.result)
+        for name in ("t", "x", "u", "costate", "objective"):
+            one, other = np.asarray(getattr(a, name)), np.asarray(getattr(b, name))
+            size = np.max(np.abs(one[np.isfinite(one)]))
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * size, err_msg=name)
 
 
 @pytest.mark.slow

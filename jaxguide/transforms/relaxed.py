@@ -3,8 +3,9 @@ problem B^N and Theorem 2."""
 
 from typing import Any
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array
 from jaxguide.bounds import joined_bounds
 from jaxguide.problem import Problem
 from jaxguide.transforms.wrapped import Wrapped, own_fields, rewrapped

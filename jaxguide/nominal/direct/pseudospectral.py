@@ -307,7 +307,8 @@ class Pseudospectral(Method):
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
         unmoved, start = jax.tree_util.tree_map(still, (program, start))
         program = dataclasses.replace(unmoved, edges=program.edges)
-        return program, start, jax.tree_util.tree_map(xp.asarray, options)
+        numbers = np.asarray if on_numpy(w.x0) else jnp.asarray
+        return program, start, jax.tree_util.tree_map(numbers, options)
 
 
 def finished(
