@@ -47,6 +47,7 @@ def test_lanes_are_single_solves(count):
 
 
 @pytest.mark.parametrize("count", [64, slow(256)])
+@pytest.mark.slow
 def test_vmap_under_jit_ends(count):
     # sequential_vmap: batched LAPACK has deadlocked at 64.
     k = jnp.linspace(0.5, 2.0, count)

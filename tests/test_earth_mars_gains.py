@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import at, flags, gain, history, slow
+from conftest import at, flags, gain, history
 
 import jaxguide as jg
 from jaxguide.problems.earth_mars import EarthMars
@@ -172,7 +172,8 @@ def truth(earth_mars):
     return times, jg.gain_schedule(earth_mars, times, segments=192, nodes=12, sweeps=16).K
 
 
-@pytest.mark.parametrize(("segments", "nodes"), [slow(16, 4), (32, 6), slow(64, 4)])
+@pytest.mark.parametrize(("segments", "nodes"), [(16, 4), (32, 6), (64, 4)])
+@pytest.mark.slow
 def test_the_error_estimate_is_honest(earth_mars, truth, segments, nodes):
     times, K = truth
     s = jg.gain_schedule(earth_mars, times, segments=segments, nodes=nodes)

@@ -259,6 +259,7 @@ def test_report_in_a_browser(store, tmp_path):
 # The command line ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_store_is_read_by_the_command_line(mission, tmp_path, monkeypatch, capfd):
     """rerun by the store's own dispersions; refused where the mission has changed since."""
     monkeypatch.setattr(cli, "configure", lambda: None)
