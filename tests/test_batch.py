@@ -55,6 +55,7 @@ def test_vmap_under_jit_ends(count):
     np.testing.assert_allclose(jax.jit(jax.vmap(objective))(k), 6 / k**2, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_failed_lane_disturbs_no_other():
     class Reach(DoubleIntegrator):
         asked: object = 1.0

@@ -406,6 +406,7 @@ def test_a_failure_in_a_batch_spoils_only_its_own_gradient(earth_mars):
     assert np.all(np.isnan(slope[1:3]))
 
 
+@pytest.mark.slow
 def test_not_minimising_is_told_apart(earth_mars):
     e, size = earth_mars, earth_mars.sizes()
     judge = lambda u: judged(dataclasses.replace(e, u=u), size, e.residual)
