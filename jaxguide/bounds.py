@@ -19,8 +19,7 @@ def bounds_of(bounds: Any, size: int, dtype: Any) -> tuple[Array, Array]:
 
 
 def joined_bounds(bounds: Any, size: int, more: Any, further: int) -> tuple[Array, Array]:
-    """`bounds` of `size` components and, after them, those of the `further` ones that `more` is
-    for."""
+    """`bounds` of `size` components, followed by the bounds `more` of `further` components."""
     parts = (bounds_of(b, k, jnp.result_type(float)) for b, k in ((bounds, size), (more, further)))
     lower, upper = zip(*parts, strict=True)
     return xp.concatenate(lower), xp.concatenate(upper)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, slow
+from conftest import DoubleIntegrator
 
 import jaxguide as jg
 
@@ -46,7 +46,8 @@ def test_lanes_are_single_solves(count):
     np.testing.assert_array_equal(e.costate[3], one.costate)
 
 
-@pytest.mark.parametrize("count", [64, slow(256)])
+@pytest.mark.parametrize("count", [64, 256])
+@pytest.mark.slow
 def test_vmap_under_jit_ends(count):
     # sequential_vmap: batched LAPACK has deadlocked at 64.
     k = jnp.linspace(0.5, 2.0, count)
@@ -54,6 +55,7 @@ def test_vmap_under_jit_ends(count):
     np.testing.assert_allclose(jax.jit(jax.vmap(objective))(k), 6 / k**2, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_failed_lane_disturbs_no_other():
     class Reach(DoubleIntegrator):
         asked: object = 1.0

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import at, flags, gain, history, slow
+from conftest import at, flags, gain, history
 
 import jaxguide as jg
 from jaxguide.problems.earth_mars import EarthMars
@@ -40,6 +40,7 @@ def test_segmented_against_exact_gains(at_paper_times):
 @pytest.mark.parametrize(
     ("method", "wanted"), [("least_squares", GAINS_LEAST_SQUARES), ("square", GAINS_SQUARE)]
 )
+@pytest.mark.slow
 def test_the_papers_gains(earth_mars, method, wanted):
     s = jg.gain_schedule(earth_mars, PAPER_TIMES, method, nodes=65)
     for t, K in zip(PAPER_TIMES, s.K[:, 0], strict=True):
@@ -152,6 +153,7 @@ def test_gains_for_thrust_and_target_against_re_solved(at_paper_times):
     np.testing.assert_allclose(at_paper_times.K_target[0, 0].sum(), target, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_between_times_the_schedule_is_as_good_as_at_them(schedule, at_paper_times):
     for t in (0.111, 1.687, 2.5, 3.2001):
         # Same sweep, evaluated elsewhere; both within their errors of the truth.
@@ -172,7 +174,8 @@ def truth(earth_mars):
     return times, jg.gain_schedule(earth_mars, times, segments=192, nodes=12, sweeps=16).K
 
 
-@pytest.mark.parametrize(("segments", "nodes"), [slow(16, 4), (32, 6), slow(64, 4)])
+@pytest.mark.parametrize(("segments", "nodes"), [(16, 4), (32, 6), (64, 4)])
+@pytest.mark.slow
 def test_the_error_estimate_is_honest(earth_mars, truth, segments, nodes):
     times, K = truth
     s = jg.gain_schedule(earth_mars, times, segments=segments, nodes=nodes)

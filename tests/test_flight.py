@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime, at, slow
+from conftest import DoubleIntegrator, FreeTime, at
 
 import jaxguide as jg
 from jaxguide.flight.simulate import prepare
@@ -295,9 +295,10 @@ def test_sensor_and_estimator(mission):
 
 @pytest.mark.parametrize(
     "hold",
-    [jg.HoldDeviation(), slow(jg.History())],
+    [jg.HoldDeviation(), jg.History()],
     ids=["held", "history"],
 )
+@pytest.mark.slow
 def test_fixed_steps_converge_at_fourth_order_to_adaptive(law, hold):
     fly = lambda integrator: np.asarray(
         simulate(

@@ -14,6 +14,7 @@ from jaxguide import problems
 from jaxguide.problems import EarthMars
 
 
+@pytest.mark.slow
 def test_phases():
     """The moon lander as a fall and a burn, linked; each phase has its own extremal and clock."""
 

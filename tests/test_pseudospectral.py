@@ -57,7 +57,7 @@ class Everything(EarthMars):
 
 
 @pytest.mark.parametrize(
-    ("family", "segments", "points", "knots"), [("lgl", 2, 5, ()), ("lg", 3, 4, (1,))]
+    ("family", "segments", "points", "knots"), [slow("lgl", 2, 5, ()), ("lg", 3, 4, (1,))]
 )
 def test_newton_step_against_dense_algebra(family, segments, points, knots):
     ends = [1.0, 3.0, *(1.0,) * (2 if knots else 0)]
@@ -299,6 +299,7 @@ class Endless(jg.Problem):
         return x[0] ** 2 + u[0] ** 2
 
 
+@pytest.mark.slow
 def test_infinite_horizon():
     e = jg.solve(Endless(), jg.Pseudospectral(nodes=20, segments=1, refinements=0))
     # reference/pseudospectral.md: an error of 1e-10 with 20 nodes.

@@ -314,6 +314,7 @@ def test_a_wrong_free_final_time_fails_its_row(free_time):
     assert failed(spoiled.certificate)["H at the end"]["time"] == float(free_time.final_time)
 
 
+@pytest.mark.slow
 def test_zermelo_with_newton_found_heading(zermelo):
     assert not zermelo.problem.has_closed_form
     start, end = optimize.fsolve(
@@ -327,6 +328,7 @@ def test_zermelo_with_newton_found_heading(zermelo):
     assert not failed(zermelo.certificate)
 
 
+@pytest.mark.slow
 def test_forced_lqr_with_a_free_component_and_time_in_everything(lqr):
     """Running and endpoint cost, dynamics that depend on time, a start other than 0."""
     p, t0, tf = ForcedLQR(), 0.5, 2.0
@@ -369,6 +371,7 @@ def test_a_contradictory_end_names_its_constraint(double_integrator):
 
 
 @pytest.mark.parametrize("r", [(1.0, -1.0), (1.0, 0.0)], ids=["negative", "singular"])
+@pytest.mark.slow
 def test_controls_that_do_not_minimise_are_refused(regulator, r):
     with pytest.raises(jg.SolveError, match="H_uu|boundary conditions"):
         jg.solve(dataclasses.replace(Regulator(), r=r), SMALL)
@@ -403,6 +406,7 @@ def test_a_failure_in_a_batch_spoils_only_its_own_gradient(earth_mars):
     assert np.all(np.isnan(slope[1:3]))
 
 
+@pytest.mark.slow
 def test_not_minimising_is_told_apart(earth_mars):
     e, size = earth_mars, earth_mars.sizes()
     judge = lambda u: judged(dataclasses.replace(e, u=u), size, e.residual)

@@ -231,6 +231,7 @@ def test_report_of_an_unfinished_sweep(mission, tmp_path):
         write(tmp_path / "a")
 
 
+@pytest.mark.slow
 def test_report_in_a_browser(store, tmp_path):
     """Headless Chromium, without network: it draws every figure, in a light and a dark scheme."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -259,6 +260,7 @@ def test_report_in_a_browser(store, tmp_path):
 # The command line ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_store_is_read_by_the_command_line(mission, tmp_path, monkeypatch, capfd):
     """rerun by the store's own dispersions; refused where the mission has changed since."""
     monkeypatch.setattr(cli, "configure", lambda: None)

@@ -174,6 +174,7 @@ def test_the_worst_do_not_depend_on_order():
 # Flights in full -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_flights_in_full(mission, tmp_path):
     cliff = dataclasses.replace(mission, plant=Cliff())
     options = {"histories": 5, "failures": 4}

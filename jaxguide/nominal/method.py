@@ -68,7 +68,8 @@ class Method(eqx.Module):
         **Arguments:**
 
         - `problem`: checked, every leaf an array (traced, perhaps). Derivatives by its leaves
-          should be implicit, of the conditions that were met, never through the iterations.
+          should be implicit, of the conditions that were met, never through the iterations; where
+          none were met they are NaN.
         - `guess`: None, an Extremal of a similar problem, and what `capabilities` admits besides.
 
         **Returns:** an Extremal in the user's units, on segments that share their ends, whose

@@ -29,12 +29,12 @@ def implicit_root(
     is the caller's to say (`differentiable_if`). Where Newton meets a singular Jacobian the answer
     is `z` itself, so that a failure shows by how much the conditions are missed.
 
-    **Arguments:** `tolerance`: of what the last step leaves, relative to the unknowns and to
-    `size`, how large each unknown is (default: one). `within`: of the residual before the last
-    step, if it is scaled.
+    **Arguments:** `tolerance`: of the error that the last step leaves, relative to `size`, the
+    unit of each unknown (default: one), and to the unknown in it. `within`: of the residual before
+    the last step, if it is scaled.
 
-    Not by a library's Newton, which raises inside its derivative where the residual is NaN: in a
-    batch a failure must be a value. Nor do its lanes end there.
+    Optimistix's Newton raises inside its derivative where the residual is NaN; in a batch a failure
+    must be a value.
     """
     flat, unravel = jax.flatten_util.ravel_pytree(z)
     ones = jnp.ones_like(flat)

@@ -1,4 +1,4 @@
-"""What a solve is given: problem, method and guess, checked and on a finite horizon."""
+"""The input of a solve: problem, method and guess, checked and on a finite horizon."""
 
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ class Given(NamedTuple):
 
 
 def given(problem: Problem, method: Any, guess: Any) -> Given:
-    """What a method is given for `problem` and `guess`, once nothing is wrong with either.
+    """The input of `method` for `problem` and `guess`, once both are checked.
 
     **Raises:** `ValueError`.
     """

@@ -58,13 +58,13 @@ def solve(
     return certified(extremal, by.accuracy)
 
 
-# What `solve` does under a trace: pure. Compiled, else a bare jax.grad runs it operation by
+# The solve under a trace, pure; compiled whole, because a bare `jax.grad` would run it operation by
 # operation.
 on_fixed_mesh = eqx.filter_jit(called)
 
 
 def _found(start: Given, watch: Any, otherwise: Method | None) -> tuple[Method, Extremal]:
-    """The extremal on the host, and the method that it is by.
+    """The extremal, sought on the host, and the method that found it.
 
     `otherwise`: a direct method to start from where an indirect one finds nothing by itself. Where
     both fail its extremal is returned: it says which constraint is missed, and where.

@@ -69,9 +69,10 @@ def unknown_sizes(problem: Problem, z: Unknowns, ends: Float[Array, "arc two_n_1
 
 
 def unknown_units(problem: Problem, z: Unknowns) -> Unknowns:
-    """What Newton's steps are measured in, as powers of two, by which nothing is rounded: sizes;
-    but of a costate at least what the largest product of state and costate makes of it. One that
-    vanishes (of a state that nothing depends on) is rounding, which no step makes smaller."""
+    """Units of Newton's steps: the size of each unknown, as a power of two, by which nothing is
+    rounded. The unit of a costate is at least the largest product of state and costate over the
+    size of its own state: the costate of a state on which nothing depends is pure rounding, and no
+    step makes that smaller."""
     size, n = unknown_sizes(problem, z, z.starts), problem.n
     x, costate = size.starts[:, :n], size.starts[:, n:]
     worth = jnp.max(x * costate)

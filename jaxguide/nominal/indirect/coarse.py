@@ -14,8 +14,9 @@ from jaxguide.problem import Problem, is_free
 # Residual, relative to what a change of every unknown by its size would do to it, below which the
 # iteration ends, and below which it counts as converged: coarse steps are off by more than either.
 _SETTLED, CONVERGED = 1e-9, 1e-7
-# The same of a residual relative to the sizes at the start: of an unknown that vanishes at the
-# solution nothing but rounding is left, and its own size is that of the rounding.
+# Residual, relative to the sizes at the start, that counts as `_SETTLED`: a costate that vanishes
+# at the solution is pure rounding there, and relative to its own size never settles. Chosen, not
+# tuned: some 500 roundings.
 _ROUNDING = 1e-13
 _RISE = 2.0  # a residual may rise by this factor: Newton often climbs before it falls
 _SHORTER, _SHORTEST = 0.3, 1e-3  # of a refused step; where no step is left

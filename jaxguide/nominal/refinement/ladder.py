@@ -23,7 +23,7 @@ def on_meshes(
     method: Method, problem: Problem, guess: Any, watch: Callable[[MeshStep], None] | None
 ) -> Extremal:
     """Solved from `guess`, from the method's random starts and up the ladder of grids, and refined.
-    By a method without a mesh, solved."""
+    A method without a mesh solves from `guess` alone."""
     best = _least_of_starts(method, problem, guess)
     if guess is None and not succeeded(best.result) and _has_ladder(method):
         best = _up_the_ladder(method, problem, best)
