@@ -6,8 +6,9 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array
 from jaxguide.problem import Chosen, Path, Problem, endpoint_count
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.transforms.wrapped import Wrapped, own_fields

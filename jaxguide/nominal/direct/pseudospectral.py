@@ -307,8 +307,10 @@ class Pseudospectral(Method):
         options = interior_point.Options(self.tolerance, mu, self.max_iterations, push, warm)
         unmoved, start = jax.tree_util.tree_map(still, (program, start))
         program = dataclasses.replace(unmoved, edges=program.edges)
-        numbers = np.asarray if on_numpy(w.x0) else jnp.asarray
-        return program, start, jax.tree_util.tree_map(numbers, options)
+        number = np.asarray if on_numpy(w.x0) else jnp.asarray
+        options = jax.tree_util.tree_map(number, options)
+        most = number(self.max_iterations, np.int32)
+        return program, start, options._replace(max_iterations=most)
 
 
 def finished(
