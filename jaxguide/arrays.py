@@ -184,6 +184,15 @@ def eigh(a: Any) -> Any:
         return np.full(a.shape[0], np.nan), np.full_like(a, np.nan)
 
 
+def eigvalsh(a: Any) -> Any:
+    """Eigenvalues of a batch of symmetric matrices, ascending; NaN where there are none."""
+    if not on_numpy(a):
+        return jnp.linalg.eigvalsh(a)
+    finite = np.all(np.isfinite(a), axis=(-2, -1))
+    values = np.linalg.eigvalsh(np.where(finite[..., None, None], a, 0.0))
+    return np.where(finite[..., None], values, np.nan)
+
+
 def traced_once(function: Callable) -> Callable:
     """`jax.jit` of `function` where its arguments are JAX's; itself where they are the host's."""
     program = jax.jit(function)

@@ -29,8 +29,8 @@ def overstep(values: Float[Array, "*k c"], bounds: Any) -> Float[Array, "*k c"]:
     """By how much `values` lie below their lower or above their upper bound, in their own units;
     0 within the bounds."""
     sides = bounds_of(bounds, values.shape[-1], values.dtype)
-    lo, hi = (jnp.broadcast_to(b, values.shape) for b in sides)
-    return jnp.maximum(lo - values, 0.0) + jnp.maximum(values - hi, 0.0)
+    lo, hi = (xp.broadcast_to(b, values.shape) for b in sides)
+    return xp.maximum(lo - values, 0.0) + xp.maximum(values - hi, 0.0)
 
 
 def touches(
@@ -38,46 +38,47 @@ def touches(
 ) -> Bool[Array, "*k c"]:
     """Whether `values` lie on a bound, beyond it, or within `margin` of it (in their own units)."""
     sides = bounds_of(bounds, values.shape[-1], values.dtype)
-    lo, hi, margin = (jnp.broadcast_to(b, values.shape) for b in (*sides, margin))
+    lo, hi, margin = (xp.broadcast_to(b, values.shape) for b in (*sides, margin))
     return (values <= lo + margin) | (values >= hi - margin)
 
 
 def slackness(
-    multiplier: Float[Array, " k"], values: Float[Array, " k"], bounds: Any, size: Array
-) -> Float[Array, " k"]:
+    multiplier: Float[Array, "*lead k"], values: Float[Array, "*lead k"], bounds: Any, size: Array
+) -> Float[Array, "*lead k"]:
     """By how much complementarity fails: |multiplier| times the distance to the bound that its
     sign names (lower if negative, upper if positive), in units of `size`.
 
     Zero where that bound is active, and where the multiplier is zero.
     """
-    lo, hi = bounds_of(bounds, values.shape[0], values.dtype)
-    distance = jnp.where(multiplier > 0, hi - values, values - lo) / size
+    sides = bounds_of(bounds, values.shape[-1], values.dtype)
+    lo, hi, size = (xp.broadcast_to(a, values.shape) for a in (*sides, size))
+    distance = xp.where(multiplier > 0, hi - values, values - lo) / size
     # A bound at infinity is infinitely far away: at most one `size` is counted, so that the product
     # stays finite.
-    return jnp.abs(multiplier) * jnp.clip(distance, 0.0, 1.0)
+    return xp.abs(multiplier) * xp.clip(distance, 0.0, 1.0)
 
 
 def bound_size(values: Float[Array, " k"], bounds: Any) -> Float[Array, " k"]:
     """What errors of `values` are relative to: the largest of |value| and its finite bounds; 1
     where all of them are zero."""
-    return positive(jnp.maximum(jnp.abs(values), largest_bound(bounds, values.shape[0])))
+    return positive(xp.maximum(xp.abs(values), largest_bound(bounds, values.shape[0])))
 
 
 def size_along(values: Float[Array, "node k"], bounds: Any) -> Float[Array, " k"]:
     """What errors of a quantity are relative to along a trajectory: its largest |value| over the
     nodes. Of one that is zero everywhere, its largest finite bound, and 1 where that is zero too.
     """
-    largest = jnp.max(jnp.abs(values), axis=0)
+    largest = xp.max(xp.abs(values), axis=0)
     of_bounds = largest_bound(bounds, values.shape[1]).astype(values.dtype)
-    return positive(jnp.where(largest > 0, largest, of_bounds))
+    return positive(xp.where(largest > 0, largest, of_bounds))
 
 
 def largest_bound(bounds: Any, k: int) -> Float[Array, " k"]:
     """The larger absolute value of the finite ones of both bounds; 0 where neither is finite."""
-    both = jnp.stack(bounds_of(bounds, k, jnp.result_type(float)))
-    return jnp.max(jnp.where(jnp.isfinite(both), jnp.abs(both), 0.0), axis=0)
+    both = xp.stack(bounds_of(bounds, k, jnp.result_type(float)))
+    return xp.max(xp.where(xp.isfinite(both), xp.abs(both), 0.0), axis=0)
 
 
 def positive(size: Array) -> Array:
     """`size`, and 1 where it is zero: something to divide by."""
-    return jnp.where(size > 0, size, 1.0)
+    return xp.where(size > 0, size, 1.0)

@@ -6,8 +6,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Bool, Float
 
+from jaxguide.arrays import Array, put
 from jaxguide.bounds import bounds_of, size_along
 from jaxguide.conditions.control import polish_control
 from jaxguide.conditions.sizes import Sizes, sizes_of
@@ -62,7 +64,7 @@ class Trajectory(eqx.Module):
         """Nodal values gathered segment by segment, shared ends repeated."""
         p = self.reference_nodes.shape[0]
         segments = (self.t.shape[0] - 1) // (p - 1)
-        index = jnp.arange(segments)[:, None] * (p - 1) + jnp.arange(p)[None, :]
+        index = np.arange(segments)[:, None] * (p - 1) + np.arange(p)[None, :]
         return values[index]
 
     def interpolate(self, values: Float[Array, "node *k"], t: Any) -> Array:
@@ -143,7 +145,7 @@ class Extremal(Trajectory):
 
     def _own_ends(self, values: Array, before: Array | None) -> Array:
         parts = self.by_segment(values)
-        return parts if before is None else parts.at[:, -1].set(before)
+        return parts if before is None else put(parts, np.s_[:, -1], before)
 
     def __call__(self, t: Any) -> Point:
         """State, control and costate at `t`, scalar or (T,); held beyond the horizon.

@@ -55,7 +55,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "transforms",
         "matrices",
     ),
-    "problem": ("statement", "parameters", "counts", "boundary", "validation"),
+    "problem": ("statement", "parameters", "counts", "points", "boundary", "validation"),
     "conditions": ("hamiltonian", "control", "canonical", "angles", "sizes", "units", "bounded"),
     "transforms": ("wrapped", "integrals", "relaxed", "endless", "phased", "state_as_time"),
     "nominal": (
@@ -74,7 +74,6 @@ ORDER: dict[str, tuple[str, ...]] = {
     "nominal.direct": (
         "collocation",
         "unknowns",
-        "points",
         "transcription",
         "trees",
         "limits",

@@ -1,55 +1,80 @@
 """An extremal evaluated for the checks: at its nodes, and at Gauss points between them."""
 
-from collections.abc import Callable
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxguide.conditions.hamiltonian import endpoint_lagrangian
+from jaxguide.arrays import Array, xp
 from jaxguide.problem import Problem
-from jaxguide.spectral import interpolation_matrix, nodes_lg
+from jaxguide.problem.points import end_slopes, integrand_slopes, slopes
+from jaxguide.spectral import nodes_lg
+from jaxguide.spectral.either import interpolating
 from jaxguide.trajectory import Extremal
 
 
+class Evaluated(NamedTuple):
+    """At points of an extremal, "*k" of them: the dynamics; H with what the integrands add; the
+    gradients of H bar by (x, u, t); the integrands."""
+
+    f: Float[Array, "*k n"]
+    hamiltonian: Float[Array, "*k"]
+    by_x: Float[Array, "*k n"]
+    by_u: Float[Array, "*k m"]
+    by_t: Float[Array, "*k"]
+    integrands: Float[Array, "*k r"]
+
+
+def evaluated(
+    problem: Problem, t: Array, x: Array, u: Array, costate: Array, held: Array
+) -> Evaluated:
+    """H bar = H + `held`^T (path constraints, states, controls, integrands) and what it consists
+    of, at points of any leading axes. Review, H bar."""
+    lead, n, m = t.shape, problem.n, problem.m
+    t, (x, u, costate, held) = (
+        t.reshape(-1),
+        (a.reshape(-1, a.shape[-1]) for a in (x, u, costate, held)),
+    )
+    at, (gain, gain_by) = slopes(problem, t, x, u), integrand_slopes(problem, t, x, u)
+    p = at.path.shape[1]
+    of_path, of_own, of_gain = held[:, :p], held[:, p : p + n + m], held[:, p + n + m :]
+    dot = lambda by, rows: (by[:, None] @ rows)[:, 0]
+    slope = at.cost_by + dot(costate, at.f_by) + dot(of_path, at.path_by) + dot(of_gain, gain_by)
+    value = at.cost + xp.sum(costate * at.f, axis=1) + xp.sum(of_gain * gain, axis=1)
+    back = lambda a: a.reshape(*lead, *a.shape[1:])
+    by_x, by_u = slope[:, :n] + of_own[:, :n], slope[:, n : n + m] + of_own[:, n:]
+    return Evaluated(*map(back, (at.f, value, by_x, by_u, slope[:, -1], gain)))
+
+
 class Along:
-    """Values that several checks share, computed while they are traced."""
+    """Values that several checks share."""
 
     def __init__(self, extremal: Extremal):
         self.extremal, self.size = extremal, extremal.sizes()
-        t, m = extremal.t, extremal.multipliers
-        gauss, weights = (jnp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
+        t, m, problem = extremal.t, extremal.multipliers, extremal.problem
+        gauss, weights = (xp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
         self.gauss, self.weights, self.breaks = gauss, weights, extremal.breaks
-        self.half = jnp.diff(self.breaks) / 2
+        self.half = xp.diff(self.breaks) / 2
         middle = (self.breaks[1:] + self.breaks[:-1]) / 2
-        integral = jnp.broadcast_to(m.integral, (len(t), len(m.integral)))
-        # By node: (t, x, u, costate, multipliers of H bar).
-        self.held = jnp.concatenate([m.path, m.state, m.control, integral], axis=1)
-        self.nodes = (t, extremal.x, extremal.u, extremal.costate, self.held)
+        integral = xp.broadcast_to(m.integral, (len(t), len(m.integral)))
+        # Multipliers of H bar, by node.
+        held = xp.concatenate([m.path, m.state, m.control, integral], axis=1)
         self.parts = (
             extremal.by_segment(t[:, None])[..., 0],
             extremal.by_segment(extremal.x),
             extremal.control_by_segment(),
             extremal.costate_by_segment(),
-            extremal.by_segment(self.held),
+            extremal.by_segment(held),
         )
-        to_gauss = interpolation_matrix(extremal.reference_nodes, gauss)
+        to_gauss = interpolating(extremal.reference_nodes, gauss)
         times = middle[:, None] + self.half[:, None] * gauss[None, :]
-        between = (jnp.einsum("gp,spk->sgk", to_gauss, a) for a in self.parts[1:])
-        self.between = (times, *between)
-
-    def at_nodes(self, f: Callable) -> Array:
-        """f(problem, t, x, u, costate, held) at every node."""
-        return jax.vmap(lambda *at: f(self.extremal.problem, *at))(*self.nodes)
-
-    def at_gauss(self, f: Callable, problem: Problem | None = None) -> Array:
-        """The same on the Gauss points of every segment; of another `problem`, if given."""
-        of = self.extremal.problem if problem is None else problem
-        return jax.vmap(jax.vmap(lambda *at: f(of, *at)))(*self.between)
+        self.between = (times, *(to_gauss @ a for a in self.parts[1:]))
+        self.at_nodes = evaluated(problem, t, extremal.x, extremal.u, extremal.costate, held)
+        self.at_gauss = evaluated(problem, *self.between)
+        self.at_ends = end_slopes(problem, *self.ends())
 
     def integrals(self, values: Float[Array, "segment gauss *k"]) -> Float[Array, "segment *k"]:
         """The integral over each segment, from `values` at its Gauss points."""
-        sums = jnp.einsum("g,sg...->s...", self.weights, values)
+        sums = xp.einsum("g,sg...->s...", self.weights, values)
         return self.half.reshape(-1, *(1,) * (sums.ndim - 1)) * sums
 
     def ends(self) -> tuple[Array, Array, Array, Array]:
@@ -58,6 +83,7 @@ class Along:
         return e.x[0], e.x[-1], e.t[0], e.t[-1]
 
     def endpoint_gradient(self) -> tuple[Array, Array, Array, Array]:
-        """Gradient of Ebar by each of `ends`."""
-        g = jax.grad(endpoint_lagrangian, argnums=(2, 3, 4, 5))
-        return g(self.extremal.problem, self.extremal.multipliers.endpoint, *self.ends())
+        """Gradient of Ebar = E + nu^T e (2002 paper, eq. (5)) by each of `ends`."""
+        n, nu = self.extremal.problem.n, self.extremal.multipliers.endpoint
+        g = self.at_ends.by[0] + nu @ self.at_ends.by[1:]
+        return g[:n], g[n + 2 :], g[n], g[n + 1]

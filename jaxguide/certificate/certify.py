@@ -1,12 +1,16 @@
 """How good an extremal is: its Certificate, computed independently of its solver."""
 
 import equinox as eqx
+import jax
+import numpy as np
 
+from jaxguide.arrays import on_device
 from jaxguide.certificate import checks, costly
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Certificate, Checks
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import closed
+from jaxguide.types import is_traced
 
 
 def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -> Certificate:
@@ -20,14 +24,19 @@ def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -
 
     **Source:** 2002 paper, eqs (2)-(9); review, section 4.
     """
-    return _certified(extremal, costly, tolerance)
+    if is_traced(extremal):
+        return _compiled(extremal, costly, tolerance)
+    with np.errstate(all="ignore"):
+        flown = Checks()
+        if costly:
+            flown = Checks.of(jax.device_get(_flown(extremal)))
+        return on_device(_certified(jax.device_get(_closed(extremal)), flown, tolerance))
 
 
-@eqx.filter_jit
-def _certified(extremal: Extremal, fly: bool, tight: float) -> Certificate:
-    rows, along = Checks(), Along(extremal if extremal.stretch is None else closed(extremal))
-    if fly:
-        costly.propagation(rows, along)
+def _certified(extremal: Extremal, rows: Checks, tight: float) -> Certificate:
+    """The certificate of all that `rows` holds already, and of the checks that nothing is flown
+    for."""
+    along = Along(extremal)
     for check in (
         checks.canonical_equations,
         checks.boundary,
@@ -40,4 +49,29 @@ def _certified(extremal: Extremal, fly: bool, tight: float) -> Certificate:
         checks.spectral_tails,
     ):
         check(rows, along, tight)
+    return rows.done()
+
+
+@eqx.filter_jit
+def _finite(extremal: Extremal) -> Extremal:
+    return closed(extremal)
+
+
+def _closed(extremal: Extremal) -> Extremal:
+    """`extremal` on a finite horizon."""
+    return extremal if extremal.stretch is None else _finite(extremal)
+
+
+@eqx.filter_jit
+def _compiled(extremal: Extremal, fly: bool, tight: float) -> Certificate:
+    rows, extremal = Checks(), _closed(extremal)
+    if fly:
+        costly.propagation(rows, Along(extremal))
+    return _certified(extremal, rows, tight)
+
+
+@eqx.filter_jit
+def _flown(extremal: Extremal) -> Certificate:
+    rows = Checks()
+    costly.propagation(rows, Along(_closed(extremal)))
     return rows.done()

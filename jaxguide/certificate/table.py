@@ -6,7 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+
+from jaxguide.arrays import Array, xp
 
 
 class Certificate(eqx.Module):
@@ -44,21 +46,18 @@ class Certificate(eqx.Module):
             return f"{passed.sum()} of {len(passed)} lanes pass; at worst:\n{self.worst()}"
         width = max(len(name) for name in self.names)
         lines = []
-        rows = zip(
-            self.names,
-            self.labels,
-            np.asarray(self.value),
-            np.asarray(self.tolerance),
-            np.asarray(self.time),
-            np.asarray(self.component),
-            np.asarray(self.passed),
-            strict=True,
-        )
-        for name, labels, value, tolerance, time, component, passed in rows:
+        for name, labels, value, tolerance, time, component, passed in self._by_row():
             where = f"{labels[int(component) % len(labels)]} at t = {time:.6g}" if labels else ""
             verdict = "ok   " if passed else "FAILS"
             lines.append(f"{verdict} {name:{width}s} {value:9.2e} <= {tolerance:7.1e}  {where}")
         return "\n".join(lines)
+
+    def _by_row(self) -> Any:
+        """Name, labels, value, tolerance, time, component and verdict of each row."""
+        value, tolerance = np.asarray(self.value), np.asarray(self.tolerance)
+        where = (np.asarray(self.time), np.asarray(self.component))
+        passed = value <= tolerance
+        return zip(self.names, self.labels, value, tolerance, *where, passed, strict=True)
 
     def rows(self) -> list[dict[str, Any]]:
         """The table as plain data; of a batch, at its worst."""
@@ -73,32 +72,38 @@ class Certificate(eqx.Module):
                 "where": labels[int(c) % len(labels)] if labels else "",
                 "passed": bool(p),
             }
-            for name, labels, v, tol, t, c, p in zip(
-                self.names, self.labels, self.value, self.tolerance, self.time, self.component,
-                self.passed, strict=True,
-            )
-        ]  # fmt: skip
+            for name, labels, v, tol, t, c, p in self._by_row()
+        ]
 
 
 class Checks:
-    """Collects rows while the checks are traced."""
+    """Collects rows."""
 
     def __init__(self):
         self.names, self.labels = [], []
         self.value, self.tolerance, self.time, self.component = [], [], [], []
 
+    @classmethod
+    def of(cls, certificate: Certificate) -> "Checks":
+        """The rows of a certificate, to be followed by others."""
+        c, rows = certificate, cls()
+        rows.names, rows.labels = list(c.names), list(c.labels)
+        rows.value, rows.tolerance = list(c.value), list(c.tolerance)
+        rows.time, rows.component = list(c.time), list(c.component)
+        return rows
+
     def add(self, name: str, labels: Any, values: Array, times: Array, tolerance: float) -> None:
         """`values` (k, c): errors of components named by `labels` at `times` (k,)."""
         if values.size == 0:
             return
-        values = jnp.abs(values)
-        flat = jnp.where(jnp.isnan(values), jnp.inf, values)
-        worst = jnp.argmax(flat)
+        values = xp.abs(values)
+        flat = xp.where(xp.isnan(values), xp.inf, values)
+        worst = xp.argmax(flat)
         node, component = worst // values.shape[1], worst % values.shape[1]
         self.names.append(name)
         self.labels.append(tuple(labels))
         self.value.append(values[node, component])
-        self.tolerance.append(jnp.asarray(tolerance, values.dtype))
+        self.tolerance.append(xp.asarray(tolerance, values.dtype))
         self.time.append(times[node])
         self.component.append(component)
 
@@ -109,13 +114,13 @@ class Checks:
         self.names.append(name)
         self.labels.append(tuple(labels))
         self.value.append(value)
-        self.tolerance.append(jnp.asarray(tolerance, value.dtype))
+        self.tolerance.append(xp.asarray(tolerance, value.dtype))
         self.time.append(time)
-        self.component.append(jnp.zeros((), jnp.int64 if value.dtype == jnp.float64 else jnp.int32))
+        self.component.append(xp.zeros((), jnp.int64 if value.dtype == jnp.float64 else jnp.int32))
 
     def done(self) -> Certificate:
         """The Certificate of all rows."""
-        stack = jnp.stack
+        stack = lambda parts: xp.stack(parts)
         return Certificate(
             tuple(self.names),
             tuple(self.labels),

@@ -5,13 +5,13 @@
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.bounds import overstep, slackness
 from jaxguide.conditions.sizes import Sizes
 from jaxguide.problem import Problem
+from jaxguide.problem.points import rates
 
 
 class BoundErrors(NamedTuple):
@@ -43,7 +43,7 @@ def _over(values: Float[Array, "node k"], bounds: Any, size: Array) -> Float[Arr
 
 def _kinds(problem: Problem, t: Array, x: Array, u: Array, size: Sizes) -> Any:
     """Values, bounds and sizes of path constraints, of states and of controls."""
-    h = jax.vmap(problem.path_constraints)(t, x, u)
+    h = rates(problem, t, x, u)[2]
     return (
         (h, problem.path_bounds, size.path),
         (x, problem.state_bounds, size.x),
@@ -62,9 +62,8 @@ def bound_errors(
     """`multipliers`: of path constraints, states and controls, (node, k) each."""
     kinds = _kinds(problem, t, x, u, size)
     path, state, control = (_over(*kind) for kind in kinds)
-    slack = jax.vmap(slackness, in_axes=(0, 0, None, None))
     signs = [
-        slack(by, values, within, of) * of[None]
+        slackness(by, values, within, of) * of[None]
         for by, (values, within, of) in zip(multipliers, kinds, strict=True)
     ]
-    return BoundErrors(path, state, control, jnp.concatenate(signs, axis=1) / size.hamiltonian)
+    return BoundErrors(path, state, control, xp.concatenate(signs, axis=1) / size.hamiltonian)

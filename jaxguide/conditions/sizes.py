@@ -1,13 +1,13 @@
 """How large each quantity of an extremal is, in its own unit: errors are relative to this."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.bounds import largest_bound, positive, size_along
 from jaxguide.problem import Problem
+from jaxguide.problem.points import EndSlopes, end_slopes, integrand_slopes, slopes
 
 # A state is at rest if it stays below `_REST` of the distance by which its rate, with all terms of
 # one sign, could move it over the horizon; its size is then `_MOVED` of that. By experiment.
@@ -52,23 +52,23 @@ def sizes_of(
     """
     horizon = t[-1] - t[0]
     u_size = size_along(u, problem.control_bounds)
-    x_size = state_sizes(problem, t, x, u)
-    z = jnp.concatenate([x_size, u_size])
-    along = lambda f: jax.vmap(jax.jacfwd(_joined(f, problem.n), argnums=1))(t, _stack(x, u))
-    path = jnp.max(_known(along(problem.path_constraints)) @ z, axis=0, initial=0.0)
-    path = jnp.maximum(path, largest_bound(problem.path_bounds, path.shape[0]))
+    at = slopes(problem, t, x, u)
+    x_size = _state_sizes(at.f_by, t, x, u)
+    z = xp.concatenate([x_size, u_size])
+    path = xp.max(_known(at.path_by[:, :, :-1]) @ z, axis=0, initial=0.0)
+    path = xp.maximum(path, largest_bound(problem.path_bounds, path.shape[0]))
 
-    end = end_sizes(problem, t, x, x_size)
-    worth = jnp.max(jnp.max(jnp.abs(costate), axis=0) * x_size)
-    e_x = jax.grad(problem.endpoint_cost, argnums=1)(x[0], x[-1], t[0], t[-1])
-    cost = positive(worth + jnp.max(jnp.abs(e_x) * x_size))
+    ends = end_slopes(problem, x[0], x[-1], t[0], t[-1])
+    end = _end_sizes(problem, ends, horizon, x_size)
+    worth = xp.max(xp.max(xp.abs(costate), axis=0) * x_size)
+    e_x = ends.by[0, problem.n + 2 :]
+    cost = positive(worth + xp.max(xp.abs(e_x) * x_size))
 
-    f = jax.vmap(problem.dynamics)(t, x, u)
-    F = jax.vmap(problem.running_cost)(t, x, u)
-    gain = jax.vmap(problem.integrands)(t, x, u) @ integral
-    H = F + gain + jnp.sum(costate * f, axis=1)
-    terms = jnp.abs(F) + jnp.sum(jnp.abs(costate * f), axis=1)
-    hamiltonian = positive(jnp.max(jnp.abs(H)) + _TERMS * jnp.max(terms))
+    gain = integrand_slopes(problem, t, x, u)[0] @ integral
+    moved = costate * at.f
+    H = at.cost + gain + xp.sum(moved, axis=1)
+    terms = xp.abs(at.cost) + xp.sum(xp.abs(moved), axis=1)
+    hamiltonian = positive(xp.max(xp.abs(H)) + _TERMS * xp.max(terms))
     return Sizes(x_size, u_size, horizon, cost, hamiltonian, positive(path), end)
 
 
@@ -80,11 +80,16 @@ def end_sizes(
 ) -> Float[Array, " q"]:
     """Sizes of the endpoint constraints: how much they change when states at both ends and times
     change by their sizes, or their largest bound."""
-    e = lambda x0, xf, times: problem.endpoint_constraints(x0, xf, times[0], times[1])
-    slopes = jax.jacfwd(e, argnums=(0, 1, 2))(x[0], x[-1], jnp.stack([t[0], t[-1]]))
-    horizon = jnp.broadcast_to(t[-1] - t[0], (2,))
-    end = _known(jnp.concatenate(slopes, axis=1)) @ jnp.concatenate([x_size, x_size, horizon])
-    return positive(jnp.maximum(end, largest_bound(problem.endpoint_bounds, end.shape[0])))
+    ends = end_slopes(problem, x[0], x[-1], t[0], t[-1])
+    return _end_sizes(problem, ends, t[-1] - t[0], x_size)
+
+
+def _end_sizes(
+    problem: Problem, ends: EndSlopes, horizon: Float[Array, ""], x_size: Float[Array, " n"]
+) -> Float[Array, " q"]:
+    size = xp.concatenate([x_size, xp.broadcast_to(horizon, (2,)), x_size])
+    end = _known(ends.by[1:]) @ size
+    return positive(xp.maximum(end, largest_bound(problem.endpoint_bounds, end.shape[0])))
 
 
 def state_sizes(
@@ -94,21 +99,16 @@ def state_sizes(
     u: Float[Array, "node m"],
 ) -> Float[Array, " n"]:
     """Sizes of the states: see `sizes_of`."""
-    span, most = jnp.max(jnp.abs(x), axis=0), jnp.max(jnp.abs(u), axis=0)
-    slopes = jax.vmap(jax.jacfwd(_joined(problem.dynamics, problem.n), argnums=1))(t, _stack(x, u))
-    moved = _known(slopes) @ jnp.concatenate([span, most])
+    return _state_sizes(slopes(problem, t, x, u).f_by, t, x, u)
+
+
+def _state_sizes(f_by: Array, t: Array, x: Array, u: Array) -> Float[Array, " n"]:
+    span, most = xp.max(xp.abs(x), axis=0), xp.max(xp.abs(u), axis=0)
+    moved = _known(f_by[:, :, :-1]) @ xp.concatenate([span, most])
     # The median: at the end of an infinite horizon rates grow beyond all bounds.
-    moved = (t[-1] - t[0]) * jnp.median(moved, axis=0)
-    return positive(jnp.where(span >= _REST * moved, span, _MOVED * moved))
-
-
-def _joined(f: Any, n: int) -> Any:
-    return lambda t, z: f(t, z[:n], z[n:])
-
-
-def _stack(x: Array, u: Array) -> Array:
-    return jnp.concatenate([x, u], axis=1)
+    moved = (t[-1] - t[0]) * xp.median(moved, axis=0)
+    return positive(xp.where(span >= _REST * moved, span, _MOVED * moved))
 
 
 def _known(slopes: Array) -> Array:
-    return jnp.where(jnp.isfinite(slopes), jnp.abs(slopes), 0.0)
+    return xp.where(xp.isfinite(slopes), xp.abs(slopes), 0.0)

@@ -3,13 +3,12 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaxguide.arrays import Array, on_numpy, padded_to_ladder, traced_once, xp
+from jaxguide.arrays import Array, on_numpy, traced_once, xp
 from jaxguide.bounds import bounds_of
-from jaxguide.host.compilation import compiled
-from jaxguide.problem import Problem, with_parameters
+from jaxguide.problem import Problem
+from jaxguide.problem.points import slopes
 
 # A value below it is at rest at zero: the square root of rounding, in the user's unit. Chosen, not
 # tuned.
@@ -88,16 +87,7 @@ def _moves(
     along = (xp.broadcast_to(middle, (len(x),)), x[:, -1], u[:, -1])
     first = (t[None], x0[None], u[:1, 0])
     points = [xp.concatenate(pair) for pair in zip(first, along, strict=True)]
-    if on_numpy(*points):
-        padded = map(padded_to_ladder, points)
-        moves = jax.device_get(compiled(_slopes, True)(problem, *padded))[: len(points[0])]
-    else:
-        moves = _slopes(problem, *points)
+    n, m = x.shape[2], u.shape[2]
+    moves = slopes(problem, *points).f_by[:, :, : n + m]
     moves = xp.max(xp.where(xp.isfinite(moves), xp.abs(moves), 0.0), axis=0)
     return moves * (times[1] - times[0])
-
-
-def _slopes(problem: Problem, t: Array, x: Array, u: Array) -> Float[Array, "point n unknown"]:
-    """Slopes of the dynamics by states and controls."""
-    rate = jax.jacfwd(with_parameters(problem, None).dynamics, argnums=(1, 2))
-    return jnp.concatenate(jax.vmap(rate)(t, x, u), axis=2)

@@ -1,12 +1,12 @@
 """How far an extremal's polynomials miss its dynamics between the nodes."""
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.conditions.sizes import state_sizes
-from jaxguide.spectral import differentiation_matrix, interpolation_matrix, nodes_lg
+from jaxguide.problem.points import rates
+from jaxguide.spectral import nodes_lg
+from jaxguide.spectral.either import differentiating, interpolating
 from jaxguide.trajectory import Extremal
 
 
@@ -18,24 +18,23 @@ def defects(
     `within`: bounds that the interpolated control is cut to, (m,) each; none: flown as it is.
     """
     problem, breaks, nodes = extremal.problem, extremal.breaks, extremal.reference_nodes
-    half = jnp.diff(breaks) / 2
+    half = xp.diff(breaks) / 2
     times = (breaks[1:] + breaks[:-1])[:, None] / 2 + half[:, None] * tau[None]
-    between = interpolation_matrix(nodes, tau)
-    at = lambda matrix, values: jnp.einsum("gp,spk->sgk", matrix, values)
-    states = extremal.by_segment(extremal.x)
-    x, u = at(between, states), at(between, extremal.control_by_segment())
+    between, states = interpolating(nodes, tau), extremal.by_segment(extremal.x)
+    x, u = between @ states, between @ extremal.control_by_segment()
     if within is not None:
-        u = jnp.clip(u, within[0][None, None], within[1][None, None])
-    rate = at(between @ differentiation_matrix(nodes), states)
-    rate = rate / jnp.where(half > 0, half, 1.0)[:, None, None]
-    return rate - jax.vmap(jax.vmap(problem.dynamics))(times, x, u)
+        u = xp.clip(u, within[0][None, None], within[1][None, None])
+    rate = (between @ differentiating(nodes)) @ states
+    rate = rate / xp.where(half > 0, half, 1.0)[:, None, None]
+    flat = lambda a: a.reshape(-1, a.shape[2])
+    return rate - rates(problem, times.reshape(-1), flat(x), flat(u))[0].reshape(rate.shape)
 
 
-@eqx.filter_jit
 def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     """By segment, the integral of |dx/dt - f| between the nodes, relative to the state's span."""
-    gauss, weights = (jnp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * extremal.degree))
-    half = jnp.diff(extremal.breaks) / 2
+    gauss, weights = (xp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * extremal.degree))
+    half = xp.diff(extremal.breaks) / 2
     span = state_sizes(extremal.problem, extremal.t, extremal.x, extremal.u)
-    gap = half[:, None] * jnp.einsum("g,sgk->sk", weights, jnp.abs(defects(extremal, gauss)))
-    return jnp.max(gap / span[None], axis=1)
+    off = xp.abs(defects(extremal, gauss))
+    gap = half[:, None] * xp.einsum("g,sgk->sk", weights, off)
+    return xp.max(gap / span[None], axis=1)

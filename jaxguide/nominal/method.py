@@ -4,6 +4,7 @@ import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxguide.host.compilation import compiled
@@ -90,8 +91,13 @@ class Method(eqx.Module):
 
     def run(self, problem: Problem, guess: Any) -> Extremal:
         """`__call__` as one compiled program: what `jg.solve` calls outside a trace. A method whose
-        program is better cut in two overrides it. Host only."""
+        program is better cut in two overrides it, and may give the host's arrays. Host only."""
         return compiled(called, self.quick)(self, problem, guess)
+
+
+def on_host(method: Method, problem: Problem, guess: Any) -> Extremal:
+    """`method.run`, its numbers as the host's arrays."""
+    return jax.device_get(method.run(problem, guess))
 
 
 def called(method: Method, problem: Problem, guess: Any) -> Extremal:

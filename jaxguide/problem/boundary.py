@@ -4,8 +4,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.bounds import bounds_of
 from jaxguide.problem.statement import Free, Problem, is_free, start_value
 from jaxguide.types import is_traced
@@ -39,10 +40,10 @@ def initial_values(problem: Problem, dtype: Any) -> Float[Array, " n"]:
     """The initial state, free components where the search for them starts (`start_value`)."""
     entries = problem.initial_state
     if entries is None:
-        return jnp.zeros(problem.n, dtype)
+        return xp.zeros(problem.n, dtype)
     if isinstance(entries, (tuple, list)):
-        return jnp.stack([jnp.asarray(start_value(e), dtype) for e in entries])
-    return jnp.broadcast_to(jnp.asarray(start_value(entries), dtype), (problem.n,))
+        return xp.stack([xp.asarray(start_value(e), dtype) for e in entries])
+    return xp.broadcast_to(xp.asarray(start_value(entries), dtype), (problem.n,))
 
 
 def initial_bounds(problem: Problem) -> tuple[Array, Array]:
@@ -50,8 +51,8 @@ def initial_bounds(problem: Problem) -> tuple[Array, Array]:
     components that are `Free`."""
     lo, hi = bounds_of(problem.state_bounds, problem.n, jnp.result_type(float))
     entries = [e if is_free(e) else Free() for e in initial_entries(problem)]
-    own = [jnp.stack([jnp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
-    return jnp.maximum(lo, own[0]), jnp.minimum(hi, own[1])
+    own = [xp.stack([xp.asarray(getattr(e, k), lo.dtype) for e in entries]) for k in ("lo", "hi")]
+    return xp.maximum(lo, own[0]), xp.minimum(hi, own[1])
 
 
 def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
@@ -62,6 +63,6 @@ def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
     symmetry, which may be maxima. Chosen, not tuned.
     """
     lo, hi = bounds_of(problem.control_bounds, problem.m, dtype)
-    finite = jnp.isfinite(lo) & jnp.isfinite(hi)
-    middle = jnp.where(finite, (lo + hi) / 2, jnp.clip(jnp.zeros_like(lo), lo, hi))
-    return middle + 0.1 * jnp.where(finite, (hi - lo) / 2, 1.0)
+    finite = xp.isfinite(lo) & xp.isfinite(hi)
+    middle = xp.where(finite, (lo + hi) / 2, xp.clip(xp.zeros_like(lo), lo, hi))
+    return middle + 0.1 * xp.where(finite, (hi - lo) / 2, 1.0)

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.types import as_float, is_traced
+from jaxguide.arrays import xp
+from jaxguide.types import is_traced
 
 
 class Free(eqx.Module):
@@ -186,6 +187,6 @@ def start_value(entry: Any) -> Any:
         return entry
     if entry.guess is not None:
         return entry.guess
-    lo, hi = as_float(entry.lo), as_float(entry.hi)
-    middle = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), (lo + hi) / 2, jnp.clip(0.0, lo, hi))
-    return middle
+    lo, hi = (xp.asarray(v, jnp.result_type(float)) for v in (entry.lo, entry.hi))
+    nearest = xp.clip(xp.zeros_like(lo), lo, hi)
+    return xp.where(xp.isfinite(lo) & xp.isfinite(hi), (lo + hi) / 2, nearest)

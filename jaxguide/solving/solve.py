@@ -4,7 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
+from jaxguide.arrays import on_device
 from jaxguide.certificate import Certified, certified
 from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.method import Method, called
@@ -51,7 +53,9 @@ def solve(
     if start.traced:
         extremal = on_fixed_mesh(by, start.problem, start.guess)
     else:
-        by, extremal = _found(start, watch, Pseudospectral() if method is None else None)
+        with np.errstate(all="ignore"):
+            by, extremal = _found(start, watch, Pseudospectral() if method is None else None)
+        extremal = on_device(extremal)
     extremal = opened(extremal)
     if throw and not start.traced:
         raise_if_failed(extremal)

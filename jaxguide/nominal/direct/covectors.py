@@ -9,9 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxguide.arrays import Array, added, on_device, on_numpy, padded_to_ladder, put, xp
+from jaxguide.arrays import Array, added, put, xp
 from jaxguide.conditions.angles import unwrap_angles
-from jaxguide.host.compilation import compiled
 from jaxguide.nominal.direct import interior_point
 from jaxguide.nominal.direct.box import Box, boxed, distances
 from jaxguide.nominal.direct.collocation import left_null
@@ -66,10 +65,10 @@ def to_extremal(
         "degenerate": _undecided(limits, solution),
     }
     return Extremal(
-        **on_device(numbers),
+        **numbers,
         multipliers=_multipliers(problem, program, limits, solution, covectors.jump, spread),
         result=_result(problem, program, solution, f, residual),
-        problem=on_device(problem),
+        problem=problem,
         chosen=chosen,
     )
 
@@ -106,7 +105,7 @@ def _controls(
     own = slice(rule.first, rule.first + counts.nodes)
     x_nodes = program.support(w)[:, own].reshape(-1, counts.n) * scale.x[None]
     own_u = w.u.reshape(-1, counts.m)
-    turned = _unwrapped(
+    turned = unwrap_angles(
         problem, at_nodes, x_nodes[:, : problem.n], (own_u * scale.u[None])[:, : problem.m]
     )
     turned = put(own_u, np.s_[:, : problem.m], turned / scale.u[None, : problem.m])
@@ -159,7 +158,7 @@ def _multipliers(
         (over_nodes(net_u) / scale.u[None])[:, :m],
         nu[q : q + r],
     )
-    return Multipliers(*on_device(numbers))
+    return Multipliers(*numbers)
 
 
 def _result(
@@ -202,15 +201,6 @@ def chosen_result(condition: Any, yes: RESULTS, no: RESULTS) -> RESULTS:
     if isinstance(condition, jax.Array):
         return RESULTS.where(condition, yes, no)
     return yes if condition else no
-
-
-def _unwrapped(problem: Problem, t: Array, x: Array, u: Array) -> Array:
-    """`unwrap_angles`; on the host by a program that serves any count of nodes: the last is
-    repeated."""
-    if not on_numpy(t, x, u):
-        return unwrap_angles(problem, t, x, u)
-    padded = (padded_to_ladder(a) for a in (t, x, u))
-    return jax.device_get(compiled(unwrap_angles, True)(problem, *padded))[: len(t)]
 
 
 class Costates(NamedTuple):

@@ -11,19 +11,18 @@ from jaxtyping import Bool, Float
 from jaxguide.arrays import Array, added, on_numpy, xp
 from jaxguide.bounds import bounds_of
 from jaxguide.conditions.units import REST, natural_units
+from jaxguide.nominal.direct.stated import beginning, stated_bounds
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
-from jaxguide.nominal.ends import horizon_guess, nearest_ends
 from jaxguide.nominal.starts import UNBOUNDED, bounds_middle, control_ends, drawn_final_time
 from jaxguide.problem import (
     Problem,
     initially_free,
     is_free,
     parameters,
-    start_control,
     start_value,
-    with_parameters,
 )
+from jaxguide.problem.points import rates
 from jaxguide.spectral.grids import evaluation
 from jaxguide.trajectory import Extremal, Point
 from jaxguide.transforms.endless import evened
@@ -55,31 +54,19 @@ def straight_guess(
 ) -> Primal:
     """States on a straight line to the nearest ends that meet the endpoint constraints; controls
     in the middle of their bounds. In user units."""
-    problem, counts = with_parameters(program.problem, None), program.counts
-    dtype, n = program.dtype, counts.n
-    t0, tf = horizon_guess(program.problem)
-    x0, xf = nearest_ends(program.problem, t0, tf)
-    u = start_control(program.problem, dtype)
+    counts, at = program.counts, beginning(program.problem)
     s = fractions_at(fractions, program.rule.support[1:])
-    x = x0[None, None] + s[:, :, None] * (xf - x0)[None, None]
-    over = lambda u: jnp.broadcast_to(u, (counts.segments, counts.nodes, counts.m))
-    p = [start_value(v) for v in parameters(program.problem)]
-    times = placed(t0, tf, fractions, knots)
-    straight = without_slacks(program, x0, x, over(u), times, p)
-    u_bounds = bounds_of(problem.control_bounds, counts.m, dtype)
-    unbounded, middle = jnp.isinf(jnp.stack(u_bounds)).any(axis=0), jnp.clip(0.0, *u_bounds)
-    u = jnp.where(unbounded, middle + (u - middle) * _natural_units(program, straight)[1], u)
-    ends_at = lambda xf: problem.endpoint_constraints(x0, xf, t0, tf)
-    constrained = _endpoint_count(program) > 0
-    unasked = ~jnp.any(jax.jacfwd(ends_at)(xf) != 0, axis=0) if constrained else jnp.ones(n, bool)
-    rests = unasked & (jnp.abs(x0) < REST) & (jnp.abs(xf) < REST)
-    rests = rests & ~jnp.asarray(initially_free(program.problem))
+    x = at.x0[None, None] + s[:, :, None] * (at.xf - at.x0)[None, None]
+    over = lambda u: xp.broadcast_to(u, (counts.segments, counts.nodes, counts.m))
+    times = placed(at.t0, at.tf, fractions, knots)
+    straight = without_slacks(program, at.x0, x, over(at.u), times, at.p)
+    lo, hi = stated_bounds(program.problem).u
+    unbounded, middle = xp.isinf(lo) | xp.isinf(hi), xp.clip(xp.zeros_like(lo), lo, hi)
+    u = middle + (at.u - middle) * _natural_units(program, straight)[1]
+    u = xp.where(unbounded, u, at.u)
+    rests = at.unasked & (xp.abs(at.x0) < REST) & (xp.abs(at.xf) < REST)
+    rests = rests & ~np.asarray(initially_free(program.problem))
     return propagated(program, straight._replace(u=over(u)), rests)
-
-
-def _endpoint_count(program: Transcription) -> int:
-    """Endpoint constraints of the problem itself, without the order of free times."""
-    return program.counts.end - len(program.order)
 
 
 def _natural_units(program: Transcription, w: Primal) -> tuple[Array, Array]:
@@ -93,34 +80,35 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     leave them there. The one of three constant controls that fits the other states' rates best is
     taken.
     """
-    problem, counts, dtype = with_parameters(program.problem, None), program.counts, program.dtype
-    lo, hi = bounds_of(problem.control_bounds, counts.m, dtype)
-    width = jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), hi - lo, 0.0)
+    if on_numpy(rests) and not np.any(rests):
+        return w
+    dtype, bounds = program.dtype, stated_bounds(program.problem)
+    lo, hi = bounds.u
+    width = xp.where(xp.isfinite(lo) & xp.isfinite(hi), hi - lo, 0.0)
     spans = program.clocks @ w.times
     h, middle = (spans[:, 1] - spans[:, 0])[:, None], (spans[:, 0] + spans[:, 1]) / 2
-    ends = jnp.concatenate([w.x0[None], w.x[:, -1]])
-    across, halfway = jnp.diff(ends, axis=0), (ends[1:] + ends[:-1]) / 2
-    rate = jax.jit(jax.vmap(problem.dynamics))  # traced once
+    ends = xp.concatenate([w.x0[None], w.x[:, -1]])
+    across, halfway = xp.diff(ends, axis=0), (ends[1:] + ends[:-1]) / 2
+    rate = lambda x, u: rates(program.problem, middle, x, u)[0]
 
-    def gains(share: Array) -> tuple[Array, Array]:
+    def gains(share: float) -> tuple[Array, Array]:
         """The change of the resting states over each segment, and the misfit of the others."""
         u = w.u[:, 0] + share * width[None]
-        gained = h * rate(middle, halfway, u)
-        gained = jnp.where(rests[None] & jnp.isfinite(gained), gained, 0.0)
-        left = h * rate(middle, halfway + jnp.cumsum(gained, axis=0) - gained / 2, u) - across
-        return gained, jnp.sum(jnp.where(rests[None], 0.0, jnp.abs(left)))
+        gained = h * rate(halfway, u)
+        gained = xp.where(rests[None] & xp.isfinite(gained), gained, 0.0)
+        left = h * rate(halfway + xp.cumsum(gained, axis=0) - gained / 2, u) - across
+        return gained, xp.sum(xp.where(rests[None], 0.0, xp.abs(left)))
 
-    shares = jnp.asarray(_SHARES, dtype)
-    tries, misfit = jax.vmap(gains)(shares)
-    misfit = jnp.where(jnp.isfinite(misfit), misfit, jnp.inf)
-    best = jnp.argmin(misfit * (1 + jnp.abs(shares)))  # the middle if alike
-    gained, share = tries[best], jnp.where(jnp.any(rests), shares[best], 0.0)
-    along = jnp.asarray((program.rule.support[1:] + 1) / 2, dtype)
-    start = jnp.cumsum(gained, axis=0) - gained
+    shares = xp.asarray(_SHARES, dtype)
+    tries, misfit = (xp.stack(a) for a in zip(*map(gains, _SHARES), strict=True))
+    misfit = xp.where(xp.isfinite(misfit), misfit, xp.inf)
+    best = xp.argmin(misfit * (1 + xp.abs(shares)))  # the middle if alike
+    gained, share = tries[best], xp.where(xp.any(rests), shares[best], 0.0)
+    along = xp.asarray((program.rule.support[1:] + 1) / 2, dtype)
+    start = xp.cumsum(gained, axis=0) - gained
     more = start[:, None] + along[None, :, None] * gained[:, None]
-    x_lo, x_hi = bounds_of(problem.state_bounds, counts.n, dtype)
-    x = jnp.where(rests[None, None], jnp.clip(w.x + more, x_lo[None, None], x_hi[None, None]), w.x)
-    return w._replace(x=x, u=w.u + (share * width)[None, None])
+    x = xp.clip(w.x + more, bounds.x[0][None, None], bounds.x[1][None, None])
+    return w._replace(x=xp.where(rests[None, None], x, w.x), u=w.u + (share * width)[None, None])
 
 
 def random_guess(
@@ -159,13 +147,12 @@ def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Fl
 
 
 def without_slacks(
-    program: Transcription, x0: Array, x: Array, u: Array, times: Array, p: list
+    program: Transcription, x0: Array, x: Array, u: Array, times: Array, p: Array
 ) -> Primal:
     """A guess whose slacks are zero, to be set from the constraints' values."""
     counts, dtype = program.counts, program.dtype
-    p_ = xp.stack([xp.asarray(v, dtype) for v in p]) if p else xp.zeros(0, dtype)
     path = xp.zeros((counts.segments, counts.nodes, counts.path), dtype)
-    return Primal(x0, x, u, times, p_, path, xp.zeros(counts.end, dtype))
+    return Primal(x0, x, u, times, p, path, xp.zeros(counts.end, dtype))
 
 
 def fractions_at(fractions: Float[Array, " edge"], tau: np.ndarray) -> Float[Array, "segment k"]:
@@ -190,7 +177,8 @@ def from_extremal(
     )
     x = fill(points_of(guess, at(rule.support[1:])).x, counts.n)
     u = fill(points_of(guess, at(rule.nodes)).u, counts.m)
-    p = [start_value(v) for v in parameters(guess.problem, like=problem)]
+    p = [xp.asarray(start_value(v), dtype) for v in parameters(guess.problem, like=problem)]
+    p = xp.stack(p) if p else xp.zeros(0, dtype)
     times = placed(t0, tf, fractions, knots)
     return without_slacks(program, fill(guess.x[0], counts.n), x, u, times, p)
 

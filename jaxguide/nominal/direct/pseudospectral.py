@@ -24,8 +24,8 @@ from jaxguide.nominal.direct.covectors import to_extremal
 from jaxguide.nominal.direct.guess import edges, from_extremal, random_guess, straight_guess
 from jaxguide.nominal.direct.implicit import sensitivity
 from jaxguide.nominal.direct.limits import Limits, limits_of
-from jaxguide.nominal.direct.scaling import designer_units, unit_scale
-from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.scaling import designer_units
+from jaxguide.nominal.direct.transcription import Transcription, blank_scale
 from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.direct.warm import blank_duals, duals, fits
 from jaxguide.nominal.guesses import is_key
@@ -210,9 +210,9 @@ class Pseudospectral(Method):
             units = self.units(problem, guess).items()
             print("designer units: " + ", ".join(f"{k} {v:.4g}" for k, v in units))
         with without_collection(), np.errstate(all="ignore"):
-            near = guess if isinstance(guess, Extremal) else None
-            method, stated, near = jax.device_get((self, problem, near))
-            if near is None:
+            random = is_key(guess)
+            method, stated, near = jax.device_get((self, problem, None if random else guess))
+            if random:
                 program, start, options = jax.device_get(_prepared(self, problem, guess))
             else:
                 program, start, options = method.prepared(stated, near)
@@ -278,7 +278,7 @@ class Pseudospectral(Method):
             fractions = xp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
         else:
             fractions = xp.asarray(self.fractions, dtype)
-        unit = unit_scale(whole, len(self.knots))
+        unit = blank_scale(whole, len(self.knots))
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
         program = Transcription(

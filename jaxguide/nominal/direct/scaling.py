@@ -4,27 +4,14 @@ import dataclasses
 import operator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.arrays import Array, put, xp
 from jaxguide.conditions.units import REST, natural_units
-from jaxguide.nominal.direct.transcription import Transcription, clock_order
-from jaxguide.nominal.direct.unknowns import Primal, Scale
-from jaxguide.problem import Problem, count, endpoint_count, parameters
+from jaxguide.nominal.direct.transcription import Transcription
+from jaxguide.nominal.direct.unknowns import Primal
+from jaxguide.problem.points import Scale
 from jaxguide.transforms.endless import evened
-
-
-def unit_scale(problem: Problem, knots: int) -> Scale:
-    """User units as they are: every scale 1, of a `problem` with so many free `knots`."""
-    path, end = count(problem, "path_constraints"), endpoint_count(problem)
-    end += len(clock_order(problem, 2 + knots))
-    one = xp.ones((), jnp.result_type(float))
-    many = lambda k: xp.ones(k, one.dtype)
-    return Scale(
-        many(problem.n), many(problem.m), one, many(len(parameters(problem))), many(path),
-        many(end), one,
-    )  # fmt: skip
 
 
 def designer_units(program: Transcription, w: Primal) -> Scale:

@@ -11,23 +11,22 @@ import math
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxguide.arrays import Array, on_numpy, padded_to_ladder, traced_once, xp
-from jaxguide.host.compilation import compiled
+from jaxguide.arrays import Array, put, traced_once, xp
 from jaxguide.nominal.direct.collocation import Collocation, collocation
-from jaxguide.nominal.direct.points import (
+from jaxguide.nominal.direct.unknowns import Arcwise, Counts, Equations, Primal
+from jaxguide.problem import Problem, is_free
+from jaxguide.problem.points import (
     PointFunctions,
-    clock_order,
-    hessian,
+    Scale,
+    evaluated,
     point_derivatives,
     point_hessians,
     point_values,
+    unit_scale,
 )
-from jaxguide.nominal.direct.unknowns import Arcwise, Counts, Equations, Primal, Scale
-from jaxguide.problem import Problem
 from jaxguide.spectral import NodeFamily
 from jaxguide.spectral.grids import legendre
 
@@ -164,26 +163,37 @@ class Transcription:
     @functools.cached_property
     def functions(self) -> PointFunctions:
         """The Problem's functions at a point, scaled: they know nothing of the mesh."""
-        return PointFunctions(self.problem, self.scale, self.edges.shape[1])
+        own = self.counts.end - len(self.order)
+        return PointFunctions(self.problem, self.scale._replace(end=self.scale.end[:own]))
 
     def end_inputs(self, w: Primal) -> Float[Array, " in"]:
         """(x0, times, p, xf)."""
         return xp.concatenate([w.x0, w.times, w.p, w.x[-1, -1]])
 
-    @property
-    def _nodes_and_weights(self) -> tuple[Array, Array]:
-        rule, dtype = self.rule, self.dtype
-        return xp.asarray(rule.nodes, dtype), xp.asarray(rule.w, dtype)
+    def _points(self, w: Primal) -> tuple[tuple, tuple]:
+        """Nodes, weights and inputs of every node, one after the other, and of the ends, which know
+        the first two times alone."""
+        rule, dtype, q = self.rule, self.dtype, self.inputs(w)
+        each = lambda a: xp.asarray(xp.broadcast_to(a, q.shape[:2]).reshape(-1), dtype)
+        ends = xp.concatenate([w.x0, w.times[:2], w.p, w.x[-1, -1]])
+        return (each(rule.nodes), each(rule.w), q.reshape(-1, q.shape[2])), (ends,)
+
+    def _by_segment(self, a: Array) -> Array:
+        return a.reshape(-1, self.points, *a.shape[1:])
+
+    @functools.cached_property
+    def _own_ends(self) -> np.ndarray:
+        """Which of `end_inputs` are no free knot."""
+        counts = self.counts
+        kept = np.ones(2 * counts.n + counts.times + counts.parameters, bool)
+        kept[counts.n + 2 : counts.n + counts.times] = False
+        return np.flatnonzero(kept)
 
     @traced_once  # like those below
     def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
-        """`node` at every node, and `end`."""
-        if on_numpy(w.x0):
-            return self._at_points(point_values, w)
-        over = jax.vmap(jax.vmap(self.functions.node), in_axes=(None, None, 0))
-        return over(*self._nodes_and_weights, self.inputs(w)), self.functions.end(
-            self.end_inputs(w)
-        )
+        """`PointFunctions.node` at every node; E, e, and the times' differences."""
+        node, end = evaluated(point_values, self.functions, *self._points(w))
+        return self._by_segment(node), xp.concatenate([end, self.order @ w.times])
 
     def roughness(self, u: Float[Array, "segment node m *k"]) -> Float[Array, "segment node m *k"]:
         """Gradient, linear in u, of half the weighted squares of each control's upper Legendre
@@ -224,17 +234,16 @@ class Transcription:
     @traced_once
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
         """Values and Jacobians, node by node and of the endpoint functions."""
-        if on_numpy(w.x0):
-            (value, jacobian), end = self._at_points(point_derivatives, w)
-            return Nodes(value, jacobian), Ends(*end)
-        both = lambda f: lambda *a: (f(*a), f(*a))
-        node = jax.jacfwd(both(self.functions.node), argnums=2, has_aux=True)
-        over = jax.vmap(jax.vmap(node), in_axes=(None, None, 0))
-        jacobian, value = over(*self._nodes_and_weights, self.inputs(w))
-        end_jacobian, end_value = jax.jacfwd(both(self.functions.end), has_aux=True)(
-            self.end_inputs(w)
-        )
-        return Nodes(value, jacobian), Ends(end_value, end_jacobian)
+        node, end = evaluated(point_derivatives, self.functions, *self._points(w))
+        (n, rows), p = (self.counts.n, self.order), self.counts.parameters
+        jacobian = end[1]
+        if self.counts.times > 2:
+            wide = xp.zeros_like(jacobian, shape=(len(jacobian), 2 * n + self.counts.times + p))
+            jacobian = put(wide, np.s_[:, self._own_ends], jacobian)
+        order = xp.asarray(np.pad(rows, ((0, 0), (n, n + p))), self.dtype)
+        value = xp.concatenate([end[0], rows @ w.times])
+        ends = Ends(value, xp.concatenate([jacobian, order]))
+        return Nodes(*map(self._by_segment, node)), ends
 
     def node_weights(self, y: Equations) -> Float[Array, "segment node out"]:
         """The factor of each entry of `Nodes.value` in the Lagrangian f + y^T c: -B^T y of the
@@ -248,27 +257,17 @@ class Transcription:
     ) -> tuple[Float[Array, "segment node in in"], Float[Array, "end end"]]:
         """Second derivatives of the Lagrangian f + y^T c: with respect to `inputs`, node by node,
         and, of its endpoint part, with respect to `end_inputs`."""
-        weights = self.node_weights(y)
-        c = xp.concatenate([xp.ones_like(y.end, shape=1), y.end])
-        if on_numpy(w.x0):
-            return self._at_points(point_hessians, w, weights, c)
-        node = lambda tau, w, q, c: jnp.dot(c, self.functions.node(tau, w, q))
-        over = jax.vmap(jax.vmap(hessian(node, 2)), in_axes=(None, None, 0, 0))
-        at_nodes = over(*self._nodes_and_weights, self.inputs(w), weights)
-        return at_nodes, hessian(lambda b: jnp.dot(c, self.functions.end(b)), 0)(self.end_inputs(w))
-
-    def _at_points(self, program: Any, w: Primal, *weights: Any) -> Any:
-        """The results of `program` at every node and at the ends, on the host. Nodes are padded to
-        a ladder of sizes, so that few programs serve all meshes."""
-        q = self.inputs(w)
-        S, C = q.shape[:2]
-        each = lambda a: padded_to_ladder(np.broadcast_to(a, (S, C)).reshape(-1))
-        flat = [padded_to_ladder(a.reshape(S * C, *a.shape[2:])) for a in (q, *weights[:1])]
-        points = (each(self.rule.nodes), each(self.rule.w), *flat)
-        ends = (self.end_inputs(w), *weights[1:])
-        nodes, end = jax.device_get(compiled(program, True)(self.functions, points, ends))
-        back = lambda a: a[: S * C].reshape(S, C, *a.shape[1:])
-        return jax.tree_util.tree_map(back, nodes), end
+        points, ends = self._points(w)
+        factors = self.node_weights(y)
+        factors = factors.reshape(-1, factors.shape[2])
+        own = y.end[: len(self.functions.scale.end)]
+        c = xp.concatenate([xp.ones_like(y.end, shape=1), own])
+        node, end = evaluated(point_hessians, self.functions, (*points, factors), (*ends, c))
+        if self.counts.times > 2:
+            size = 2 * self.counts.n + self.counts.times + self.counts.parameters
+            wide = xp.zeros_like(end, shape=(size, size))
+            end = put(wide, np.ix_(self._own_ends, self._own_ends), end)
+        return self._by_segment(node), end
 
 
 def node_times(program: Transcription, w: Primal, at: np.ndarray) -> Float[Array, "segment k"]:
@@ -276,3 +275,18 @@ def node_times(program: Transcription, w: Primal, at: np.ndarray) -> Float[Array
     tau = xp.asarray(at, program.dtype)
     ends = program.clocks @ w.times * program.scale.t
     return (ends[:, :1] * (1 - tau)[None] + ends[:, 1:] * (1 + tau)[None]) / 2
+
+
+def clock_order(problem: Problem, clocks: int) -> Float[np.ndarray, "row clock"]:
+    """The matrix from the times to their successive differences, which must stay above zero. It has
+    no rows unless knots or both ends are free: one free end is kept in order by its bounds."""
+    sequence = np.eye(clocks)[[0, *range(2, clocks), 1]]
+    free = is_free(problem.initial_time) and is_free(problem.final_time)
+    return np.diff(sequence, axis=0) if clocks > 2 or free else np.zeros((0, clocks))
+
+
+def blank_scale(problem: Problem, knots: int) -> Scale:
+    """User units as they are, of a `problem` with so many free `knots`."""
+    own = unit_scale(problem)
+    more = xp.ones(len(clock_order(problem, 2 + knots)), own.end.dtype)
+    return own._replace(end=xp.concatenate([own.end, more]))

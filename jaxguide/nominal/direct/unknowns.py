@@ -43,18 +43,6 @@ class Equations(NamedTuple):
     end: Float[Array, " q"]
 
 
-class Scale(NamedTuple):
-    """Designer units: a quantity in user units is its scale times the solver's number."""
-
-    x: Float[Array, " n"]
-    u: Float[Array, " m"]
-    t: Float[Array, ""]
-    p: Float[Array, " parameter"]
-    path: Float[Array, " h"]
-    end: Float[Array, " q"]
-    objective: Float[Array, ""]
-
-
 class Counts(NamedTuple):
     """Numbers of unknowns and equations of a transcription.
 

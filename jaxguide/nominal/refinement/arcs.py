@@ -4,13 +4,12 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxguide.bounds import bounds_of
-from jaxguide.spectral import legendre_matrix
+from jaxguide.problem.points import rates
+from jaxguide.spectral.either import to_legendre
 from jaxguide.trajectory import Extremal
 
 # A bound is active where a value comes nearer to it than this share of the distance between the
@@ -44,12 +43,12 @@ def arcs(extremal: Extremal) -> Arcs:
     """The active sets along `extremal`, from its nodes."""
     problem = extremal.problem
     # Points that are no nodes of the quadrature hold extrapolated controls.
-    inverse = np.asarray(legendre_matrix(extremal.reference_nodes))
-    own = np.abs(inverse[0]) > 1e-9
-    t, x, u = (np.asarray(a) for a in _by_segment(extremal))
+    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > 1e-9
+    t = extremal.by_segment(extremal.t[:, None])[..., 0]
+    x, u = extremal.by_segment(extremal.x), extremal.control_by_segment()
     flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
     t, x, u = flat(t), flat(x), flat(u)
-    h = np.asarray(jax.vmap(problem.path_constraints)(t, x, u))
+    h = rates(problem, t, x, u)[2]
     labels = [
         _near(u, problem.control_bounds, _NEAR_CONTROL),
         _near(x, problem.state_bounds, _NEAR),
@@ -96,7 +95,7 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
     changed = np.any(held != labels[:, :m], axis=1, keepdims=True)
     lo, hi = (np.asarray(b) for b in bounds_of(problem.control_bounds, m, u.dtype))
     u = np.where(held > 0, hi, np.where(held < 0, lo, u))
-    h = np.asarray(jax.vmap(problem.path_constraints)(t, x, u))
+    h = rates(problem, t, x, u)[2]
     path = labels[:, m + problem.n :]
     path = np.where(changed, _near(h, problem.path_bounds, _NEAR), path)
     labels = np.concatenate([held, labels[:, m : m + problem.n], path], axis=1)
@@ -105,25 +104,15 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
 
 def _own(extremal: Extremal, values: Any) -> np.ndarray:
     """`values` (node, ...) at the nodes of the quadrature alone, segment after segment."""
-    values = np.asarray(values)
     flat = values.reshape(values.shape[0], -1)
-    own = np.abs(np.asarray(legendre_matrix(extremal.reference_nodes))[0]) > 1e-9
-    by_segment = np.asarray(extremal.by_segment(jnp.asarray(flat)))[:, own]
+    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > 1e-9
+    by_segment = extremal.by_segment(flat)[:, own]
     return by_segment.reshape(-1, *values.shape[1:])
 
 
 def _before(keep: np.ndarray, first: np.ndarray) -> list[int]:
     """Of each arc in `first` but the first, the last arc of `keep` ahead of it."""
     return [int(keep[np.searchsorted(keep, k) - 1]) for k in first[1:]]
-
-
-@jax.jit
-def _by_segment(extremal: Extremal):
-    return (
-        extremal.by_segment(extremal.t[:, None])[..., 0],
-        extremal.by_segment(extremal.x),
-        extremal.control_by_segment(),
-    )
 
 
 def _cut(t: np.ndarray, labels: np.ndarray) -> Arcs:

@@ -2,15 +2,12 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxguide.conditions.hamiltonian import hamiltonian
 from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.refinement.arcs import Arcs
+from jaxguide.problem.points import control_curvature
 from jaxguide.trajectory import Extremal
 
 _SEGMENTS_A_HORIZON = 8  # of the mesh with free knots: a first choice, tried on ten problems
@@ -58,20 +55,18 @@ def laid_out(extremal: Extremal, found: Arcs) -> Layout:
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
-    known = Arcwise(*(jnp.asarray(np.array(a)) for a in (held, smooth, released, unpathed)))
+    known = Arcwise(*(np.array(a) for a in (held, smooth, released, unpathed)))
     return Layout(np.array(breaks), tuple(knots), np.array(edges), known)
 
 
 def _affine(extremal: Extremal) -> Bool[np.ndarray, " m"]:
     """Which controls H is linear in."""
-    return np.asarray(_curvature(extremal)) <= _LINEAR
+    return _curvature(extremal) <= _LINEAR
 
 
-@eqx.filter_jit
-def _curvature(extremal: Extremal) -> Float[Array, " m"]:
+def _curvature(extremal: Extremal) -> Float[np.ndarray, " m"]:
     """The largest second derivative of H by each control (its row of H_uu), relative to H."""
-    along = jax.vmap(jax.hessian(hamiltonian, argnums=3), in_axes=(None, 0, 0, 0, 0))
-    at = (extremal.problem, extremal.t, extremal.x, extremal.u, extremal.costate)
-    size = extremal.sizes()
-    rows = jnp.abs(along(*at)) * (size.u[:, None] * size.u[None, :])[None]
-    return jnp.max(rows, axis=(0, 2)) / size.hamiltonian
+    e, size = extremal, extremal.sizes()
+    h_uu = control_curvature(e.problem, e.t, e.x, e.u, e.costate)
+    rows = np.abs(h_uu) * (size.u[:, None] * size.u[None, :])[None]
+    return np.max(rows, axis=(0, 2)) / size.hamiltonian

@@ -3,13 +3,12 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.nominal.direct.unknowns import Arcwise
-from jaxguide.spectral import legendre_matrix
+from jaxguide.spectral.either import to_legendre
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS
 
@@ -37,18 +36,17 @@ class MeshStep(NamedTuple):
         )
 
 
-@eqx.filter_jit
 def tails(extremal: Extremal) -> Float[Array, ""]:
     """Largest of the last two Legendre coefficients of state and costate, relative to their size:
     by Jackson's theorem (review, section 4.4) what a finer grid could still change."""
-    last = legendre_matrix(extremal.reference_nodes)[-2:]
+    last = to_legendre(extremal.reference_nodes)[-2:]
     parts = (extremal.by_segment(extremal.x), extremal.costate_by_segment())
     size = extremal.sizes()
     tails = [
-        jnp.max(jnp.abs(jnp.einsum("rp,spk->srk", last, v)) / of[None, None])
+        xp.max(xp.abs(last @ v) / of[None, None])
         for v, of in zip(parts, (size.x, size.costate), strict=True)
     ]
-    return jnp.maximum(*tails)
+    return xp.maximum(*tails)
 
 
 def moved(

@@ -8,10 +8,10 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.nominal.defects import segment_errors
+from jaxguide.nominal.method import on_host
 from jaxguide.nominal.refinement.arcs import Arcs, corrected, without_collapsed
 from jaxguide.nominal.refinement.layout import laid_out
 from jaxguide.nominal.refinement.meshes import MeshStep, remeshed
@@ -52,7 +52,7 @@ def structured(
     if not clear or isinstance(problem, Endless):
         return extremal, np.inf
     exact, edges = _solved(method, problem, extremal, found)
-    error = float(jnp.max(segment_errors(exact)))
+    error = float(np.max(segment_errors(exact)))
     ends = np.asarray(exact.breaks)[edges]
     again = functools.partial(structured, method, problem, exact, watch=watch)
     sound = succeeded(exact.result)
@@ -81,9 +81,9 @@ def _solved(
     asked = method.tolerance
     sharp = dataclasses.replace(method, tolerance=min(asked, EXACT))
     knotted = remeshed(sharp, mesh.fractions, _NODES, mesh.knots, mesh.arcwise)
-    exact = knotted.run(problem, extremal)
+    exact = on_host(knotted, problem, extremal)
     if not succeeded(exact.result):
-        exact = dataclasses.replace(knotted, tolerance=asked).run(problem, exact)
+        exact = on_host(dataclasses.replace(knotted, tolerance=asked), problem, exact)
     return exact, mesh.edges
 
 
