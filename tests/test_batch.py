@@ -42,8 +42,9 @@ def test_lanes_are_single_solves(count):
     assert np.all(np.asarray(e.result == jg.RESULTS.successful))
     assert meter.shown[-1] == 1.0 and meter.closed
     one = jg.solve(pushed(k[3]), METHOD)
-    np.testing.assert_array_equal(e.x[3], one.x)
-    np.testing.assert_array_equal(e.costate[3], one.costate)
+    # A single solve is NumPy's, a lane XLA's: the same steps, rounded in another order.
+    np.testing.assert_allclose(e.x[3], one.x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(e.costate[3], one.costate, rtol=0, atol=1e-11)  # sizes up to 48
 
 
 @pytest.mark.parametrize("count", [64, 256])

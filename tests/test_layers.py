@@ -54,6 +54,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "maps",
         "transforms",
         "matrices",
+        "either",
     ),
     "problem": ("statement", "parameters", "counts", "points", "boundary", "validation"),
     "conditions": ("hamiltonian", "control", "canonical", "angles", "sizes", "units", "bounded"),
@@ -74,6 +75,7 @@ ORDER: dict[str, tuple[str, ...]] = {
     "nominal.direct": (
         "collocation",
         "unknowns",
+        "stated",
         "transcription",
         "trees",
         "limits",

@@ -19,9 +19,9 @@ from jaxguide.nominal.direct.guess import edges
 from jaxguide.nominal.direct.kkt_factor import factorise
 from jaxguide.nominal.direct.kkt_step import newton_step
 from jaxguide.nominal.direct.transcription import Transcription
-from jaxguide.problem.points import Scale
 from jaxguide.nominal.direct.unknowns import Equations, Primal
 from jaxguide.problem import with_array_leaves
+from jaxguide.problem.points import Scale
 from jaxguide.problems import EarthMars
 from jaxguide.spectral import FAMILIES
 

@@ -24,7 +24,7 @@ class Evaluated(NamedTuple):
     integrands: Float[Array, "*k r"]
 
 
-def evaluated(
+def hamiltonian_along(
     problem: Problem, t: Array, x: Array, u: Array, costate: Array, held: Array
 ) -> Evaluated:
     """H bar = H + `held`^T (path constraints, states, controls, integrands) and what it consists
@@ -68,8 +68,10 @@ class Along:
         to_gauss = interpolating(extremal.reference_nodes, gauss)
         times = middle[:, None] + self.half[:, None] * gauss[None, :]
         self.between = (times, *(to_gauss @ a for a in self.parts[1:]))
-        self.at_nodes = evaluated(problem, t, extremal.x, extremal.u, extremal.costate, held)
-        self.at_gauss = evaluated(problem, *self.between)
+        self.at_nodes = hamiltonian_along(
+            problem, t, extremal.x, extremal.u, extremal.costate, held
+        )
+        self.at_gauss = hamiltonian_along(problem, *self.between)
         self.at_ends = end_slopes(problem, *self.ends())
 
     def integrals(self, values: Float[Array, "segment gauss *k"]) -> Float[Array, "segment *k"]:

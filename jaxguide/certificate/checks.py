@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxguide.arrays import Array, eigvalsh, on_numpy, xp
 from jaxguide.bounds import bound_size, overstep, slackness
-from jaxguide.certificate.along import Along, evaluated
+from jaxguide.certificate.along import Along, hamiltonian_along
 from jaxguide.certificate.table import Checks
 from jaxguide.conditions.bounded import bound_errors
 from jaxguide.conditions.hamiltonian import constrained_hamiltonian, endpoint_lagrangian
@@ -92,7 +92,7 @@ def energy(rows: Checks, a: Along, tight: float) -> None:
         # Where controls jump between nodes the pointwise value misleads; its mean by the nodes' own
         # quadrature, 1/2 sum_i w_i H_i on each segment, does not.
         own = to_legendre(extremal.reference_nodes)[0]
-        parts = evaluated(problem, *a.parts).hamiltonian
+        parts = hamiltonian_along(problem, *a.parts).hamiltonian
         mean = xp.sum(2 * half * (parts @ own)) / (tf - t0)
         ahead = drift[-1] - xp.concatenate([xp.zeros_like(drift[:1]), drift[:-1]])
         ahead = xp.sum(half * 2 * ahead) / (tf - t0)

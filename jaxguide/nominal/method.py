@@ -95,7 +95,7 @@ class Method(eqx.Module):
         return compiled(called, self.quick)(self, problem, guess)
 
 
-def on_host(method: Method, problem: Problem, guess: Any) -> Extremal:
+def run_on_host(method: Method, problem: Problem, guess: Any) -> Extremal:
     """`method.run`, its numbers as the host's arrays."""
     return jax.device_get(method.run(problem, guess))
 

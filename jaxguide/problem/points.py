@@ -95,7 +95,7 @@ def hessian(f: Any, argnum: int) -> Any:
     return symmetric
 
 
-def evaluated(program: Any, functions: PointFunctions, points: tuple, ends: tuple) -> Any:
+def at_points(program: Any, functions: PointFunctions, points: tuple, ends: tuple) -> Any:
     """The result of a `program` above; on the host `_AT_ONCE` points at a time."""
     if not on_numpy(points, ends):
         return program(functions, points, ends)
@@ -131,7 +131,7 @@ def rates(
         stated, over = with_parameters(problem, None), lambda f: jax.vmap(f)(t, x, u)
         return over(stated.dynamics), over(stated.running_cost), over(stated.path_constraints)
     functions, points, ends, rate = _as_points(problem, t, x, u)
-    value, _ = evaluated(point_values, functions, points, ends)
+    value, _ = at_points(point_values, functions, points, ends)
     return value[:, : problem.n] / rate, value[:, problem.n] / rate[:, 0], value[:, problem.n + 1 :]
 
 
@@ -151,9 +151,9 @@ def slopes(
         by, value = jax.vmap(jax.jacfwd(both, has_aux=True))(along)
         return Slopes(*value, *by)
     functions, points, ends, rate = _as_points(problem, t, x, u)
-    (value, jacobian), _ = evaluated(point_derivatives, functions, points, ends)
+    (value, jacobian), _ = at_points(point_derivatives, functions, points, ends)
     # t is t_a, and dt/dtau does not change with t_a and t_b alike.
-    by = np.concatenate(
+    by: Any = np.concatenate(
         [jacobian[:, :, : n + m], jacobian[:, :, n + m : n + m + 2].sum(axis=2, keepdims=True)],
         axis=2,
     )
@@ -203,7 +203,7 @@ def control_curvature(
     path = np.zeros((len(t), len(functions.scale.path)))
     factors = np.concatenate([costate / rate, 1 / rate, path], axis=1)
     none = np.zeros(1 + len(functions.scale.end))
-    at, _ = evaluated(point_hessians, functions, (*points, factors), (*ends, none))
+    at, _ = at_points(point_hessians, functions, (*points, factors), (*ends, none))
     return at[:, n : n + m, n : n + m]
 
 
@@ -231,7 +231,7 @@ def end_slopes(problem: Problem, x0: Array, xf: Array, t0: Array, tf: Array) -> 
     functions, points, ends, _ = _as_points(
         problem, t, np.stack([x0, xf]), np.zeros((2, problem.m))
     )
-    _, (value, by) = evaluated(point_derivatives, functions, points, ends)
+    _, (value, by) = at_points(point_derivatives, functions, points, ends)
     return EndSlopes(value, np.delete(by, np.s_[n + 2 : n + 2 + len(functions.scale.p)], axis=1))
 
 
@@ -248,7 +248,7 @@ def _as_points(problem: Problem, t: Array, x: Array, u: Array) -> Any:
     return PointFunctions(problem, one), points, (ends,), ((after - t) / 2)[:, None]
 
 
-def start_parameters(problem: Problem) -> Float[Array, " k"]:
+def start_parameters(problem: Problem) -> Float[np.ndarray, " k"]:
     """The static parameters where the search for them starts."""
     entries = parameters(problem)
     return np.array([float(np.asarray(start_value(v))) for v in entries], jnp.result_type(float))

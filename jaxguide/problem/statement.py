@@ -188,5 +188,6 @@ def start_value(entry: Any) -> Any:
     if entry.guess is not None:
         return entry.guess
     lo, hi = (xp.asarray(v, jnp.result_type(float)) for v in (entry.lo, entry.hi))
-    nearest = xp.clip(xp.zeros_like(lo), lo, hi)
-    return xp.where(xp.isfinite(lo) & xp.isfinite(hi), (lo + hi) / 2, nearest)
+    bounded, nearest = xp.isfinite(lo) & xp.isfinite(hi), xp.clip(xp.zeros_like(lo), lo, hi)
+    low, high = (xp.where(bounded, side, 0.0) for side in (lo, hi))
+    return xp.where(bounded, (low + high) / 2, nearest)

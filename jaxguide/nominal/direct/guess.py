@@ -103,7 +103,7 @@ def propagated(program: Transcription, w: Primal, rests: Bool[Array, " n"]) -> P
     tries, misfit = (xp.stack(a) for a in zip(*map(gains, _SHARES), strict=True))
     misfit = xp.where(xp.isfinite(misfit), misfit, xp.inf)
     best = xp.argmin(misfit * (1 + xp.abs(shares)))  # the middle if alike
-    gained, share = tries[best], xp.where(xp.any(rests), shares[best], 0.0)
+    gained, share = tries[best], xp.where(xp.any(rests), xp.take(shares, best), 0.0)
     along = xp.asarray((program.rule.support[1:] + 1) / 2, dtype)
     start = xp.cumsum(gained, axis=0) - gained
     more = start[:, None] + along[None, :, None] * gained[:, None]
@@ -175,15 +175,15 @@ def from_extremal(
     fill = lambda y, k: xp.concatenate(
         [y, xp.zeros((*y.shape[:-1], k - y.shape[-1]), dtype)], axis=-1
     )
-    x = fill(points_of(guess, at(rule.support[1:])).x, counts.n)
-    u = fill(points_of(guess, at(rule.nodes)).u, counts.m)
+    x = fill(points_between(guess, at(rule.support[1:])).x, counts.n)
+    u = fill(points_between(guess, at(rule.nodes)).u, counts.m)
     p = [xp.asarray(start_value(v), dtype) for v in parameters(guess.problem, like=problem)]
     p = xp.stack(p) if p else xp.zeros(0, dtype)
     times = placed(t0, tf, fractions, knots)
     return without_slacks(program, fill(guess.x[0], counts.n), x, u, times, p)
 
 
-def points_of(guess: Extremal, times: Float[Array, "segment k"]) -> Point:
+def points_between(guess: Extremal, times: Float[Array, "segment k"]) -> Point:
     """`Extremal.point` at many times."""
     if not on_numpy(guess.t, times):
         return jax.vmap(jax.vmap(guess.point))(times)

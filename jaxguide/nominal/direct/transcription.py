@@ -21,7 +21,7 @@ from jaxguide.problem import Problem, is_free
 from jaxguide.problem.points import (
     PointFunctions,
     Scale,
-    evaluated,
+    at_points,
     point_derivatives,
     point_hessians,
     point_values,
@@ -192,7 +192,7 @@ class Transcription:
     @traced_once  # like those below
     def values(self, w: Primal) -> tuple[Float[Array, "segment node out"], Float[Array, " end"]]:
         """`PointFunctions.node` at every node; E, e, and the times' differences."""
-        node, end = evaluated(point_values, self.functions, *self._points(w))
+        node, end = at_points(point_values, self.functions, *self._points(w))
         return self._by_segment(node), xp.concatenate([end, self.order @ w.times])
 
     def roughness(self, u: Float[Array, "segment node m *k"]) -> Float[Array, "segment node m *k"]:
@@ -234,7 +234,7 @@ class Transcription:
     @traced_once
     def derivatives(self, w: Primal) -> tuple[Nodes, Ends]:
         """Values and Jacobians, node by node and of the endpoint functions."""
-        node, end = evaluated(point_derivatives, self.functions, *self._points(w))
+        node, end = at_points(point_derivatives, self.functions, *self._points(w))
         (n, rows), p = (self.counts.n, self.order), self.counts.parameters
         jacobian = end[1]
         if self.counts.times > 2:
@@ -262,7 +262,7 @@ class Transcription:
         factors = factors.reshape(-1, factors.shape[2])
         own = y.end[: len(self.functions.scale.end)]
         c = xp.concatenate([xp.ones_like(y.end, shape=1), own])
-        node, end = evaluated(point_hessians, self.functions, (*points, factors), (*ends, c))
+        node, end = at_points(point_hessians, self.functions, (*points, factors), (*ends, c))
         if self.counts.times > 2:
             size = 2 * self.counts.n + self.counts.times + self.counts.parameters
             wide = xp.zeros_like(end, shape=(size, size))

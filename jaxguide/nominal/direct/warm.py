@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxguide.arrays import Array, put, xp
-from jaxguide.nominal.direct.guess import fractions_at, interpolated, points_of
+from jaxguide.nominal.direct.guess import fractions_at, interpolated, points_between
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.trees import zeros_like
 from jaxguide.nominal.direct.unknowns import Equations, Primal
@@ -74,7 +74,7 @@ def _defect_multipliers(
     """-w lambda at the nodes: review (2012), Remark 3; `times` of the nodes and of the ends."""
     counts, rule, scale, dtype = program.counts, program.rule, program.scale, program.dtype
     r = guess.multipliers.integral
-    costate = points_of(guess, times).costate
+    costate = points_between(guess, times).costate
     # The costate of an integral is its multiplier, constant in time.
     constant = xp.broadcast_to(r, (*costate.shape[:2], r.shape[0]))
     lam = xp.concatenate([costate, constant], axis=2) * (scale.x / scale.objective)[None, None]

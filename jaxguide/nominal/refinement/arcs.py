@@ -48,17 +48,17 @@ def arcs(extremal: Extremal) -> Arcs:
     x, u = extremal.by_segment(extremal.x), extremal.control_by_segment()
     flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
     t, x, u = flat(t), flat(x), flat(u)
-    h = rates(problem, t, x, u)[2]
+    h: Any = rates(problem, t, x, u)[2]
     labels = [
         _near(u, problem.control_bounds, _NEAR_CONTROL),
         _near(x, problem.state_bounds, _NEAR),
         _near(h, problem.path_bounds, _NEAR),
     ]
-    return _cut(t, np.concatenate(labels, axis=1))
+    return _cut(np.asarray(t), np.concatenate(labels, axis=1))
 
 
-def _near(values: Float[np.ndarray, "node k"], bounds: Any, share: float) -> np.ndarray:
-    """-1 near the lower bound, 1 near the upper, 0 between."""
+def _near(values: Any, bounds: Any, share: float) -> np.ndarray:
+    """`values` (node, k): -1 near the lower bound, 1 near the upper, 0 between."""
     lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
     span = np.maximum(np.ptp(values, axis=0), _SAME * np.max(np.abs(values), axis=0))
     near = share * np.minimum(hi - lo, span)
@@ -95,18 +95,18 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
     changed = np.any(held != labels[:, :m], axis=1, keepdims=True)
     lo, hi = (np.asarray(b) for b in bounds_of(problem.control_bounds, m, u.dtype))
     u = np.where(held > 0, hi, np.where(held < 0, lo, u))
-    h = rates(problem, t, x, u)[2]
+    h: Any = rates(problem, t, x, u)[2]
     path = labels[:, m + problem.n :]
     path = np.where(changed, _near(h, problem.path_bounds, _NEAR), path)
     labels = np.concatenate([held, labels[:, m : m + problem.n], path], axis=1)
     return _runs(t, labels, least=lambda a, b: True)
 
 
-def _own(extremal: Extremal, values: Any) -> np.ndarray:
+def _own(extremal: Extremal, values: Any) -> Any:
     """`values` (node, ...) at the nodes of the quadrature alone, segment after segment."""
     flat = values.reshape(values.shape[0], -1)
     own = np.abs(to_legendre(extremal.reference_nodes)[0]) > 1e-9
-    by_segment = extremal.by_segment(flat)[:, own]
+    by_segment = np.asarray(extremal.by_segment(flat))[:, own]
     return by_segment.reshape(-1, *values.shape[1:])
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxguide.nominal.method import Method, on_host
+from jaxguide.nominal.method import Method, run_on_host
 from jaxguide.nominal.refinement.meshes import MeshStep
 from jaxguide.nominal.refinement.refine import refined
 from jaxguide.problem import Problem
@@ -32,9 +32,9 @@ def on_meshes(
 
 def _least_of_starts(method: Any, problem: Problem, guess: Any) -> Extremal:
     """From `guess` and from random starts, the least objective that converged."""
-    best = on_host(method, problem, guess)
+    best = run_on_host(method, problem, guess)
     for k in range(1, method.starts if method.capabilities.mesh else 1):
-        other = on_host(method, problem, jax.random.fold_in(jax.random.key(method.seed), k))
+        other = run_on_host(method, problem, jax.random.fold_in(jax.random.key(method.seed), k))
         good, better = (succeeded(e.result) for e in (best, other))
         if better and not (good and float(best.objective) <= float(other.objective)):
             best = other
@@ -46,23 +46,23 @@ def _up_the_ladder(method: Any, problem: Problem, best: Extremal) -> Extremal:
     too, dynamics that may be missed by a delta that shrinks to nothing (review, Theorem 2). `best`
     where that fails."""
     coarse = dataclasses.replace(method, segments=_COARSE)
-    below = on_host(coarse, problem, None)
+    below = run_on_host(coarse, problem, None)
     if succeeded(below.result):
-        found = on_host(method, problem, below)
+        found = run_on_host(method, problem, below)
         return found if succeeded(found.result) else best
     units = method.units(problem)
     crossing = np.array([units[name] for name in problem.state_names]) / units["time"]
     guess = None
     for share in _LOOSENED:
         relaxed = dataclasses.replace(coarse, relaxation=share * crossing)
-        loose = on_host(relaxed, problem, guess)
+        loose = run_on_host(relaxed, problem, guess)
         if not succeeded(loose.result):
             break
         guess = loose
     if guess is None:
         return best
-    exact = on_host(coarse, problem, guess)
-    found = on_host(method, problem, exact if succeeded(exact.result) else guess)
+    exact = run_on_host(coarse, problem, guess)
+    found = run_on_host(method, problem, exact if succeeded(exact.result) else guess)
     return found if succeeded(found.result) else best
 
 

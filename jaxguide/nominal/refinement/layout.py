@@ -1,6 +1,6 @@
 """A mesh for a structure of arcs: breaks at the junctions, free knots where controls switch."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -55,8 +55,8 @@ def laid_out(extremal: Extremal, found: Arcs) -> Layout:
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
-    known = Arcwise(*(np.array(a) for a in (held, smooth, released, unpathed)))
-    return Layout(np.array(breaks), tuple(knots), np.array(edges), known)
+    known: Any = map(np.array, (held, smooth, released, unpathed))
+    return Layout(np.array(breaks), tuple(knots), np.array(edges), Arcwise(*known))
 
 
 def _affine(extremal: Extremal) -> Bool[np.ndarray, " m"]:

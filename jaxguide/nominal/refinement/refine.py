@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxguide.nominal.defects import segment_errors
-from jaxguide.nominal.method import on_host
+from jaxguide.nominal.method import run_on_host
 from jaxguide.nominal.refinement.arcs import Arcs, arcs
 from jaxguide.nominal.refinement.meshes import MeshStep, fractions_of, moved, remeshed, tails
 from jaxguide.nominal.refinement.structured import EXACT, RIGHT, WRONG, structured
@@ -88,7 +88,7 @@ def refined(
     hear(MeshStep("first mesh", extremal, _error(extremal)))
     at, candidate, doubt = _Standing(method, method, extremal), None, np.inf
     while True:
-        errors = segment_errors(at.extremal)
+        errors = np.asarray(segment_errors(at.extremal))
         if not succeeded(at.extremal.result) or not np.all(np.isfinite(errors)):
             why = "for the solve failed"
             break
@@ -161,7 +161,7 @@ def _taken(
     at = following.standing
     fractions = moved(fractions_of(at.extremal), errors, following.segments)
     method = remeshed(at.method, fractions, following.nodes)
-    better = on_host(method, problem, at.extremal)
+    better = run_on_host(method, problem, at.extremal)
     error = _error(better)
     hear(MeshStep(following.step, better, error))
     if not succeeded(better.result):
@@ -178,7 +178,7 @@ def _sharpened(at: _Standing, problem: Problem) -> Extremal:
     if not succeeded(at.extremal.result):
         return at.extremal
     tolerance = min(at.mesh.tolerance, EXACT)
-    exact = on_host(
+    exact = run_on_host(
         dataclasses.replace(at.mesh, starts=1, tolerance=tolerance), problem, at.extremal
     )
     allowed = max(_error(at.extremal), at.method.mesh_tolerance)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxguide.nominal.defects import segment_errors
-from jaxguide.nominal.method import on_host
+from jaxguide.nominal.method import run_on_host
 from jaxguide.nominal.refinement.arcs import Arcs, corrected, without_collapsed
 from jaxguide.nominal.refinement.layout import laid_out
 from jaxguide.nominal.refinement.meshes import MeshStep, remeshed
@@ -81,9 +81,9 @@ def _solved(
     asked = method.tolerance
     sharp = dataclasses.replace(method, tolerance=min(asked, EXACT))
     knotted = remeshed(sharp, mesh.fractions, _NODES, mesh.knots, mesh.arcwise)
-    exact = on_host(knotted, problem, extremal)
+    exact = run_on_host(knotted, problem, extremal)
     if not succeeded(exact.result):
-        exact = on_host(dataclasses.replace(knotted, tolerance=asked), problem, exact)
+        exact = run_on_host(dataclasses.replace(knotted, tolerance=asked), problem, exact)
     return exact, mesh.edges
 
 
