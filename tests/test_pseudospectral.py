@@ -436,7 +436,10 @@ ONE_MESH = jg.Pseudospectral(nodes=5, segments=4, refinements=0)
         slow(HeldByPath(), ONE_MESH),
         slow(Endless(), dataclasses.replace(ONE_MESH, time_scale=2.0)),
         slow(FreeTime(), dataclasses.replace(ONE_MESH, grid="lgl", smoothing=0.1)),
-        slow(DoubleIntegrator(k=jg.Free(0.5, 2.0)), dataclasses.replace(ONE_MESH, relaxation=1e-3)),
+        slow(
+            dataclasses.replace(DoubleIntegrator(), k=jg.Free(0.5, 2.0)),
+            dataclasses.replace(ONE_MESH, relaxation=1e-3),
+        ),
     ],
     ids=["knots", "path", "endless", "smoothed", "relaxed"],
 )

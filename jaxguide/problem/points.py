@@ -235,7 +235,7 @@ def end_slopes(problem: Problem, x0: Array, xf: Array, t0: Array, tf: Array) -> 
     return EndSlopes(value, np.delete(by, np.s_[n + 2 : n + 2 + len(functions.scale.p)], axis=1))
 
 
-def _as_points(problem: Problem, t: Array, x: Array, u: Array) -> Any:
+def _as_points(problem: Problem, t: Any, x: Any, u: Any) -> Any:
     """Functions in user units, and points at the starts of segments as long as the times are large;
     with dt/dtau of each."""
     size = np.max(np.abs(t), initial=0.0)

@@ -94,7 +94,7 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
     held = np.where((labels[:, :m] != 0) & clear, np.sign(multiplier), labels[:, :m])
     changed = np.any(held != labels[:, :m], axis=1, keepdims=True)
     lo, hi = (np.asarray(b) for b in bounds_of(problem.control_bounds, m, u.dtype))
-    u = np.where(held > 0, hi, np.where(held < 0, lo, u))
+    u: Any = np.where(held > 0, hi, np.where(held < 0, lo, u))
     h: Any = rates(problem, t, x, u)[2]
     path = labels[:, m + problem.n :]
     path = np.where(changed, _near(h, problem.path_bounds, _NEAR), path)
