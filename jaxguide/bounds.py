@@ -4,18 +4,20 @@ multipliers that hold them are complementary."""
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxguide.arrays import Array, xp
+from jaxguide.types import is_traced
 
 
 def bounds_of(bounds: Any, size: int, dtype: Any) -> tuple[Array, Array]:
-    """`(lower, upper)` broadcast to `(size,)` each."""
+    """`(lower, upper)` broadcast to `(size,)` each: the host's arrays unless they are traced, so
+    that a Problem's property may well compute them with JAX."""
     lower, upper = bounds
-    return (
-        xp.broadcast_to(xp.asarray(lower, dtype), (size,)),
-        xp.broadcast_to(xp.asarray(upper, dtype), (size,)),
-    )
+    number = jnp.asarray if is_traced(bounds) else np.asarray
+    over = lambda side: xp.broadcast_to(number(side, dtype), (size,))
+    return over(lower), over(upper)
 
 
 def joined_bounds(bounds: Any, size: int, more: Any, further: int) -> tuple[Array, Array]:

@@ -9,8 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import (
     Free,
@@ -161,9 +162,9 @@ class Phased(Problem):
     @property
     def endpoint_bounds(self) -> tuple[Array, Array]:
         own = self._joined("endpoint_bounds", [endpoint_count(p) for p in self.phases])
-        zero = jnp.zeros(self._links_count(), own[0].dtype)
-        last = jnp.full(len(self.phases), jnp.inf, own[0].dtype)
-        return _join([own, (zero, zero), (jnp.zeros_like(last), last)])
+        zero = np.zeros(self._links_count(), own[0].dtype)
+        last = np.full(len(self.phases), np.inf, own[0].dtype)
+        return _join([own, (zero, zero), (np.zeros_like(last), last)])
 
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
         paths: list[tuple[str | int, ...]] = []
@@ -272,7 +273,7 @@ class Phased(Problem):
 
 
 def _join(pairs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    return jnp.concatenate([a for a, _ in pairs]), jnp.concatenate([b for _, b in pairs])
+    return xp.concatenate([a for a, _ in pairs]), xp.concatenate([b for _, b in pairs])
 
 
 def _starts(phases: tuple[Problem, ...]) -> tuple[Any, ...]:
