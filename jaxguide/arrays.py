@@ -141,24 +141,17 @@ def solve_triangular(
     a: Any, b: Any, trans: int = 0, lower: bool = False, unit_diagonal: bool = False
 ) -> Any:
     """`jax.scipy.linalg.solve_triangular`; on the host `a` may be a batch."""
-    if on_numpy(a, b) and a.ndim > 2:
-        a = np.tril(a) if lower else np.triu(a)
-        if unit_diagonal:
-            a = put(a, np.s_[..., range(a.shape[-1]), range(a.shape[-1])], 1.0)
-        a = np.swapaxes(a, -1, -2) if trans else a
-        vector = b.ndim < a.ndim
-        try:
-            x = np.linalg.solve(a, b[..., None] if vector else b)
-        except np.linalg.LinAlgError:
-            x = np.full_like(b[..., None] if vector else b, np.nan)
-        return x[..., 0] if vector else x
     if not on_numpy(a, b):
         return jax.scipy.linalg.solve_triangular(
             a, b, trans=trans, lower=lower, unit_diagonal=unit_diagonal
         )
+    if a.ndim > 2:
+        one = lambda a, b: solve_triangular(a, b, trans, lower, unit_diagonal)
+        return np.stack([one(*pair) for pair in zip(a, b, strict=True)])
     if not b.size:
         return b
-    x, info = _trtrs(a, b, lower, trans, unit_diagonal)
+    # LAPACK's matrices stand by columns, so that it takes the transpose without a copy.
+    x, info = _trtrs(a.T, b, not lower, not trans, unit_diagonal)
     return x if info == 0 else np.full_like(x, np.nan)
 
 

@@ -130,10 +130,16 @@ class Extremal(Trajectory):
     # Static parameters that the solver chose; `problem` holds their values.
     chosen: Chosen | None = None
 
+    @property
+    def stated(self) -> Problem:
+        """`problem` with its static parameters as a search for them would start here: the host has
+        its functions compiled already."""
+        return self.problem if self.chosen is None else self.chosen.unsettled(self.problem)
+
     def sizes(self) -> Sizes:
         """How large each quantity is along the extremal: what its errors are relative to."""
         m = self.multipliers
-        return sizes_of(self.problem, self.t, self.x, self.u, self.costate, m.integral)
+        return sizes_of(self.stated, self.t, self.x, self.u, self.costate, m.integral)
 
     def control_by_segment(self) -> Float[Array, "segment p m"]:
         """Nodal controls segment by segment, each with its own end."""

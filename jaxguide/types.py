@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
@@ -148,6 +149,8 @@ def is_traced(tree: object) -> bool:
 
 
 def as_float(x: object) -> Array:
-    """`x` as a floating array (integers become the default float)."""
+    """`x` as a floating array (integers become the default float): NumPy's stay NumPy's."""
+    if isinstance(x, (np.ndarray, np.generic)):
+        return x if np.issubdtype(x.dtype, np.floating) else x.astype(jnp.result_type(float))
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))

@@ -50,7 +50,7 @@ class Along:
 
     def __init__(self, extremal: Extremal):
         self.extremal, self.size = extremal, extremal.sizes()
-        t, m, problem = extremal.t, extremal.multipliers, extremal.problem
+        t, m, problem = extremal.t, extremal.multipliers, extremal.stated
         gauss, weights = (xp.asarray(a, t.dtype) for a in nodes_lg(2 * extremal.degree))
         self.gauss, self.weights, self.breaks = gauss, weights, extremal.breaks
         self.half = xp.diff(self.breaks) / 2

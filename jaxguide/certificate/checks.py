@@ -92,7 +92,7 @@ def energy(rows: Checks, a: Along, tight: float) -> None:
         # Where controls jump between nodes the pointwise value misleads; its mean by the nodes' own
         # quadrature, 1/2 sum_i w_i H_i on each segment, does not.
         own = to_legendre(extremal.reference_nodes)[0]
-        parts = hamiltonian_along(problem, *a.parts).hamiltonian
+        parts = hamiltonian_along(extremal.stated, *a.parts).hamiltonian
         mean = xp.sum(2 * half * (parts @ own)) / (tf - t0)
         ahead = drift[-1] - xp.concatenate([xp.zeros_like(drift[:1]), drift[:-1]])
         ahead = xp.sum(half * 2 * ahead) / (tf - t0)
@@ -126,7 +126,7 @@ def stationarity(rows: Checks, a: Along, tight: float) -> None:
         hats = xp.concatenate([before, none]) + xp.concatenate([none, after])
         hats = hats * (size.u / (size.hamiltonian * size.t))[None]
         rows.add("stationarity of node values", names, hats, a.breaks, tight)
-    h_uu = control_curvature(problem, t, extremal.x, extremal.u, extremal.costate)
+    h_uu = control_curvature(extremal.stated, t, extremal.x, extremal.u, extremal.costate)
     least = h_uu[:, 0, 0] if problem.m == 1 else eigvalsh(h_uu)[:, 0]
     # Minus the least eigenvalue, so that the row passes if it is <= 0.
     worst = xp.argmin(least)
@@ -138,7 +138,7 @@ def bounds(rows: Checks, a: Along, tight: float) -> None:
     extremal, problem, t = a.extremal, a.extremal.problem, a.extremal.t
     m = extremal.multipliers
     covectors = (m.path, m.state, m.control)
-    found = bound_errors(problem, t, extremal.x, extremal.u, covectors, a.size)
+    found = bound_errors(extremal.stated, t, extremal.x, extremal.u, covectors, a.size)
     paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
     rows.add("path constraints", paths, found.path, t, tight)
@@ -169,9 +169,10 @@ def static_parameters(rows: Checks, a: Along, tight: float) -> None:
 
     p = chosen.values(problem)
     given = (chosen, problem, extremal.multipliers.endpoint, a.ends(), a.between, a.half, a.weights)
-    slope = _by_parameters(*given)
     if on_numpy(extremal.t):
-        slope, p = jax.device_get((compiled(_by_parameters, True)(*given), p))
+        slope = jax.device_get(compiled(_by_parameters, True)(*given))
+    else:
+        slope = _by_parameters(*given)
     of = bound_size(p, chosen.bounds)
     gap = slackness(-slope, p, chosen.bounds, of) * of / a.size.cost
     rows.add("static parameters", chosen.names, gap[None], tf[None], tight)

@@ -17,7 +17,7 @@ def defects(
 
     `within`: bounds that the interpolated control is cut to, (m,) each; none: flown as it is.
     """
-    problem, breaks, nodes = extremal.problem, extremal.breaks, extremal.reference_nodes
+    problem, breaks, nodes = extremal.stated, extremal.breaks, extremal.reference_nodes
     half = xp.diff(breaks) / 2
     times = (breaks[1:] + breaks[:-1])[:, None] / 2 + half[:, None] * tau[None]
     between, states = interpolating(nodes, tau), extremal.by_segment(extremal.x)
@@ -34,7 +34,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     """By segment, the integral of |dx/dt - f| between the nodes, relative to the state's span."""
     gauss, weights = (xp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * extremal.degree))
     half = xp.diff(extremal.breaks) / 2
-    span = state_sizes(extremal.problem, extremal.t, extremal.x, extremal.u)
+    span = state_sizes(extremal.stated, extremal.t, extremal.x, extremal.u)
     off = xp.abs(defects(extremal, gauss))
     gap = half[:, None] * xp.einsum("g,sgk->sk", weights, off)
     return xp.max(gap / span[None], axis=1)

@@ -1,5 +1,8 @@
 """How many components the constraints of a Problem have."""
 
+import functools
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -9,14 +12,29 @@ from jaxguide.problem.statement import Problem
 
 def count(problem: Problem, name: str) -> int:
     """Number of components of `name`: "path_constraints" or "integrands"."""
-    dtype = jnp.result_type(float)
-    t, x, u = (jax.ShapeDtypeStruct(s, dtype) for s in ((), (problem.n,), (problem.m,)))
-    return jax.eval_shape(getattr(with_parameters(problem, None), name), t, x, u).shape[0]
+    return _size(*_kind(problem), name)
 
 
 def endpoint_count(problem: Problem) -> int:
     """Number of endpoint constraints."""
+    return _size(*_kind(problem), "endpoint_constraints")
+
+
+def _kind(problem: Problem) -> tuple[Any, tuple[Any, ...]]:
+    leaves, structure = jax.tree_util.tree_flatten(problem)
+    return structure, tuple(map(jax.typeof, leaves))
+
+
+@functools.lru_cache(4096)  # a trace takes a millisecond, and every mesh asks ten times
+def _size(structure: Any, types: tuple[Any, ...], name: str) -> int:
+    """The number of components that the function `name` has in problems of one kind."""
     dtype = jnp.result_type(float)
-    t, x = jax.ShapeDtypeStruct((), dtype), jax.ShapeDtypeStruct((problem.n,), dtype)
-    problem = with_parameters(problem, None)
-    return jax.eval_shape(problem.endpoint_constraints, x, x, t, t).shape[0]
+    number = lambda *shape: jax.ShapeDtypeStruct(shape, dtype)
+
+    def values(problem: Problem, t: Any, x: Any, u: Any) -> Any:
+        function = getattr(with_parameters(problem, None), name)
+        return function(x, x, t, t) if name == "endpoint_constraints" else function(t, x, u)
+
+    like = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types]
+    problem = structure.unflatten(like)
+    return jax.eval_shape(values, problem, number(), number(problem.n), number(problem.m)).shape[0]

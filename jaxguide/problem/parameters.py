@@ -4,10 +4,10 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxguide.problem.statement import Problem, is_free, start_value
+from jaxguide.arrays import Array, xp
+from jaxguide.problem.statement import Free, Problem, is_free, start_value
 from jaxguide.types import as_float
 
 Path = tuple[str | int, ...]  # attributes and indices that lead from a Problem to a leaf
@@ -19,9 +19,15 @@ def with_parameters(problem: Problem, p: Any) -> Problem:
     paths = problem.parameter_paths()
     if not paths:
         return problem  # itself, and not a copy
-    entries = parameters(problem)
     if p is None:
-        p = [as_float(start_value(entry)) for entry in entries]
+        p = [as_float(start_value(entry)) for entry in parameters(problem)]
+    return placed_at(problem, paths, p)
+
+
+def placed_at(problem: Problem, paths: tuple[Path, ...], p: Any) -> Problem:
+    """`problem` with the entries of `p` at `paths`."""
+    if not paths:
+        return problem
     where = lambda q: [_follow(q, path) for path in paths]
     return eqx.tree_at(where, problem, [p[i] for i in range(len(paths))], is_leaf=is_free)
 
@@ -52,12 +58,16 @@ class Chosen(eqx.Module):
 
     def values(self, problem: Problem) -> Float[Array, " k"]:
         """The numbers that `problem` holds for them."""
-        return jnp.stack([as_float(_follow(problem, path)) for path in self.paths])
+        return xp.stack([as_float(_follow(problem, path)) for path in self.paths])
 
     def into(self, problem: Problem, p: Array) -> Problem:
         """`problem` with the numbers `p` for them."""
-        where = lambda q: [_follow(q, path) for path in self.paths]
-        return eqx.tree_at(where, problem, [p[i] for i in range(len(self.paths))])
+        return placed_at(problem, self.paths, p)
+
+    def unsettled(self, problem: Problem) -> Problem:
+        """`problem` with a `Free` for each of its numbers, which is its guess."""
+        sides = zip(*self.bounds, self.values(problem), strict=True)
+        return placed_at(problem, self.paths, [Free(*side) for side in sides])
 
 
 def choices(problem: Problem) -> Chosen | None:
@@ -65,7 +75,7 @@ def choices(problem: Problem) -> Chosen | None:
     entries = parameters(problem)
     if not entries:
         return None
-    side = lambda k: jnp.stack([as_float(getattr(e, k)) for e in entries])
+    side = lambda k: xp.stack([as_float(getattr(e, k)) for e in entries])
     return Chosen(problem.parameter_paths(), (side("lo"), side("hi")))
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxguide.arrays import Array, on_numpy, xp
 from jaxguide.host.compilation import compiled
 from jaxguide.problem.counts import count, endpoint_count
-from jaxguide.problem.parameters import parameters, with_parameters
+from jaxguide.problem.parameters import Path, parameters, placed_at, with_parameters
 from jaxguide.problem.statement import Problem, start_value
 
 # Points that a program of the host takes at once. More call it again, fewer repeat the last, so
@@ -36,17 +36,19 @@ class Scale(NamedTuple):
 
 
 class PointFunctions(eqx.Module):
-    """`problem` in the units of `scale`."""
+    """`problem` in the units of `scale`. Numbers stand at the `paths` of its static parameters,
+    whatever they are: one program serves the search and the extremal that it finds."""
 
     problem: Problem
     scale: Scale
+    paths: tuple[Path, ...] = eqx.field(static=True)
 
     def node(self, tau: Array, weight: Array, q: Float[Array, " in"]) -> Float[Array, " out"]:
         """(dt/dtau f, w dt/dtau F, h) at one node, scaled, for q = (x, u, t_a, t_b, p)."""
         n, m, scale = self.problem.n, self.problem.m, self.scale
         x, u = q[:n] * scale.x, q[n : n + m] * scale.u
         ta, tb = q[n + m] * scale.t, q[n + m + 1] * scale.t
-        problem = with_parameters(self.problem, q[n + m + 2 :] * scale.p)
+        problem = placed_at(self.problem, self.paths, q[n + m + 2 :] * scale.p)
         t = (ta * (1 - tau) + tb * (1 + tau)) / 2  # review, eq. (5)
         rate = (tb - ta) / 2
         f = rate * problem.dynamics(t, x, u) / scale.x
@@ -57,10 +59,15 @@ class PointFunctions(eqx.Module):
         """(E, e), scaled, for b = (x0, t0, tf, p, xf)."""
         n, scale = self.problem.n, self.scale
         x0, times, p, xf = b[:n], b[n : n + 2], b[n + 2 : -n], b[-n:]
-        problem = with_parameters(self.problem, p * scale.p)
+        problem = placed_at(self.problem, self.paths, p * scale.p)
         at = (x0 * scale.x, xf * scale.x, times[0] * scale.t, times[1] * scale.t)
         cost = problem.endpoint_cost(*at) / scale.objective
         return jnp.concatenate([cost[None], problem.endpoint_constraints(*at) / scale.end])
+
+
+def point_functions(problem: Problem, scale: Scale) -> PointFunctions:
+    """Those of a Problem whose parameters are still `jg.Free`, or were chosen already."""
+    return PointFunctions(with_parameters(problem, None), scale, problem.parameter_paths())
 
 
 def point_values(functions: PointFunctions, points: tuple, ends: tuple) -> tuple[Array, Array]:
@@ -178,7 +185,7 @@ def integrand_slopes(
 
 
 def _integrands(problem: Problem, along: Float[Array, "point in"]) -> Any:
-    n, twice = problem.n, lambda v: (v, v)
+    n, twice, problem = problem.n, lambda v: (v, v), with_parameters(problem, None)
     both = lambda q: twice(problem.integrands(q[-1], q[:n], q[n:-1]))
     by, value = jax.vmap(jax.jacfwd(both, has_aux=True))(along)
     return value, by
@@ -194,9 +201,10 @@ def control_curvature(
     """H_uu of H = F + lambda^T f."""
     n, m = problem.n, problem.m
     if not on_numpy(t, x, u, costate):
+        known = with_parameters(problem, None)
 
         def h(t: Array, x: Array, u: Array, costate: Array) -> Array:
-            return problem.running_cost(t, x, u) + jnp.dot(costate, problem.dynamics(t, x, u))
+            return known.running_cost(t, x, u) + jnp.dot(costate, known.dynamics(t, x, u))
 
         return jax.vmap(jax.hessian(h, argnums=2))(t, x, u, costate)
     functions, points, ends, rate = _as_points(problem, t, x, u)
@@ -218,10 +226,11 @@ def end_slopes(problem: Problem, x0: Array, xf: Array, t0: Array, tf: Array) -> 
     """Endpoint functions and their Jacobians, in user units."""
     n = problem.n
     if not on_numpy(x0, xf, t0, tf):
+        known = with_parameters(problem, None)
 
         def both(b: Array) -> tuple[Array, Array]:
             at = (b[:n], b[n + 2 :], b[n], b[n + 1])
-            cost, e = problem.endpoint_cost(*at), problem.endpoint_constraints(*at)
+            cost, e = known.endpoint_cost(*at), known.endpoint_constraints(*at)
             value = jnp.concatenate([jnp.reshape(cost, 1), e])
             return value, value
 
@@ -245,7 +254,7 @@ def _as_points(problem: Problem, t: Any, x: Any, u: Any) -> Any:
     start, weight = np.full_like(t, -1.0), np.ones_like(t)
     ends = np.concatenate([x[0], t[[0, -1]], p, x[-1]])
     points = (start, weight, np.concatenate(q, axis=1))
-    return PointFunctions(problem, one), points, (ends,), ((after - t) / 2)[:, None]
+    return point_functions(problem, one), points, (ends,), ((after - t) / 2)[:, None]
 
 
 def start_parameters(problem: Problem) -> Float[np.ndarray, " k"]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxguide.arrays import on_device
 from jaxguide.certificate import Certified, certified
+from jaxguide.host.lapack import one_thread
 from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.method import Method, called
 from jaxguide.nominal.refinement.ladder import on_meshes
@@ -53,7 +54,7 @@ def solve(
     if start.traced:
         extremal = on_fixed_mesh(by, start.problem, start.guess)
     else:
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), one_thread():
             by, extremal = _found(start, watch, Pseudospectral() if method is None else None)
         extremal = on_device(extremal)
     extremal = opened(extremal)

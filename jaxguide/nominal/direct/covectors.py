@@ -42,11 +42,13 @@ def to_extremal(
     **Source:** Ross & Karpenko, review (2012), eqs (23)-(24) and Proposition 1.
     """
     rule, scale, w = program.rule, program.scale, solution.w
-    chosen, problem = choices(problem), with_parameters(problem, w.p * scale.p)
+    chosen = choices(problem)
+    problem = with_parameters(problem, w.p * scale.p)
     n, m = problem.n, problem.m
     covectors = costates(program, limits, solution)
     spread = _spread(program)
-    u = _controls(problem, program, limits, solution, spread)
+    settled = problem if chosen is None else chosen.unsettled(problem)
+    u = _controls(settled, program, limits, solution, spread)
     x = whole(program.support(w))[:, :n] * scale.x[None, :n]
     to_user = (scale.objective / scale.x)[None, :n]
     f, _ = program.objective_and_residual(w)

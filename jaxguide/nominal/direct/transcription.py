@@ -23,6 +23,7 @@ from jaxguide.problem.points import (
     Scale,
     at_points,
     point_derivatives,
+    point_functions,
     point_hessians,
     point_values,
     unit_scale,
@@ -164,7 +165,7 @@ class Transcription:
     def functions(self) -> PointFunctions:
         """The Problem's functions at a point, scaled: they know nothing of the mesh."""
         own = self.counts.end - len(self.order)
-        return PointFunctions(self.problem, self.scale._replace(end=self.scale.end[:own]))
+        return point_functions(self.problem, self.scale._replace(end=self.scale.end[:own]))
 
     def end_inputs(self, w: Primal) -> Float[Array, " in"]:
         """(x0, times, p, xf)."""

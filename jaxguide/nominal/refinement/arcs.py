@@ -48,7 +48,7 @@ def arcs(extremal: Extremal) -> Arcs:
     x, u = extremal.by_segment(extremal.x), extremal.control_by_segment()
     flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
     t, x, u = flat(t), flat(x), flat(u)
-    h: Any = rates(problem, t, x, u)[2]
+    h: Any = rates(extremal.stated, t, x, u)[2]
     labels = [
         _near(u, problem.control_bounds, _NEAR_CONTROL),
         _near(x, problem.state_bounds, _NEAR),
@@ -95,7 +95,7 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
     changed = np.any(held != labels[:, :m], axis=1, keepdims=True)
     lo, hi = (np.asarray(b) for b in bounds_of(problem.control_bounds, m, u.dtype))
     u: Any = np.where(held > 0, hi, np.where(held < 0, lo, u))
-    h: Any = rates(problem, t, x, u)[2]
+    h: Any = rates(extremal.stated, t, x, u)[2]
     path = labels[:, m + problem.n :]
     path = np.where(changed, _near(h, problem.path_bounds, _NEAR), path)
     labels = np.concatenate([held, labels[:, m : m + problem.n], path], axis=1)

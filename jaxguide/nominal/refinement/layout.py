@@ -67,6 +67,6 @@ def _affine(extremal: Extremal) -> Bool[np.ndarray, " m"]:
 def _curvature(extremal: Extremal) -> Float[np.ndarray, " m"]:
     """The largest second derivative of H by each control (its row of H_uu), relative to H."""
     e, size = extremal, extremal.sizes()
-    h_uu = control_curvature(e.problem, e.t, e.x, e.u, e.costate)
+    h_uu = control_curvature(e.stated, e.t, e.x, e.u, e.costate)
     rows = np.abs(h_uu) * (size.u[:, None] * size.u[None, :])[None]
     return np.max(rows, axis=(0, 2)) / size.hamiltonian
