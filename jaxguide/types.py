@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 import diffrax
 import jax
@@ -148,7 +149,7 @@ def is_traced(tree: object) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(tree))
 
 
-def as_float(x: object) -> Array:
+def as_float(x: Any) -> Any:
     """`x` as a floating array (integers become the default float): NumPy's stay NumPy's."""
     if isinstance(x, (np.ndarray, np.generic)):
         return x if np.issubdtype(x.dtype, np.floating) else x.astype(jnp.result_type(float))

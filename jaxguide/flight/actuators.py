@@ -55,7 +55,8 @@ class ControlLimits(StagedActuator):
     that changes the control counts as saturated."""
 
     def start(self, plant: Problem) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        return bounds_of(plant.control_bounds, plant.m, jnp.result_type(float))
+        low, high = bounds_of(plant.control_bounds, plant.m, jnp.result_type(float))
+        return jnp.asarray(low), jnp.asarray(high)
 
     def __call__(
         self, command: Command, t_k: Any, memory: tuple[Float[Array, " m"], Float[Array, " m"]]
