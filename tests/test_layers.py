@@ -56,7 +56,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "matrices",
     ),
     "problem": ("statement", "parameters", "counts", "boundary", "validation"),
-    "conditions": ("hamiltonian", "control", "canonical", "angles", "sizes", "units", "bounded"),
+    "conditions": ("hamiltonian", "control", "canonical", "angles", "units", "sizes", "bounded"),
     "transforms": ("wrapped", "integrals", "relaxed", "endless", "phased", "state_as_time"),
     "nominal": (
         "steps",
@@ -106,8 +106,9 @@ ORDER: dict[str, tuple[str, ...]] = {
     "nominal.parametric": ("flow", "equality", "extremal", "piecewise_linear"),
     "nominal.refinement": (
         "arcs",
-        "layout",
         "meshes",
+        "marks",
+        "layout",
         "soundness",
         "structured",
         "refine",

@@ -7,11 +7,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.bounds import largest_bound, positive, size_along
+from jaxguide.conditions.units import natural_units
 from jaxguide.problem import Problem
 
 # A state is at rest if it stays below `_REST` of the distance by which its rate, with all terms of
 # one sign, could move it over the horizon; its size is then `_MOVED` of that. By experiment.
 _REST, _MOVED = 1e-6, 1e-3
+# Share of its natural unit below which a state or control is what the optimiser's tolerance, 1e-9
+# of such units, leaves of zero.
+_NOISE = 1e-9
 # Share of the largest terms of H that is added to its size: H may vanish because they cancel, and
 # errors must be relative to something. Chosen, no experiment is recorded.
 _TERMS = 1e-3
@@ -93,10 +97,15 @@ def state_sizes(
     x: Float[Array, "node n"],
     u: Float[Array, "node m"],
 ) -> Float[Array, " n"]:
-    """Sizes of the states: see `sizes_of`."""
+    """Sizes of the states: see `sizes_of`. States and controls that are nothing but rounding count
+    as large as their natural units where they move others."""
     span, most = jnp.max(jnp.abs(x), axis=0), jnp.max(jnp.abs(u), axis=0)
+    times = jnp.stack([t[0], t[-1]])
+    x_unit, u_unit = natural_units(problem, times, x[0], x[1:, None], u[1:, None])
+    x_known = jnp.where(span > _NOISE * x_unit, span, x_unit)
+    u_known = jnp.where(most > _NOISE * u_unit, most, u_unit)
     slopes = jax.vmap(jax.jacfwd(_joined(problem.dynamics, problem.n), argnums=1))(t, _stack(x, u))
-    moved = _known(slopes) @ jnp.concatenate([span, most])
+    moved = _known(slopes) @ jnp.concatenate([x_known, u_known])
     # The median: at the end of an infinite horizon rates grow beyond all bounds.
     moved = (t[-1] - t[0]) * jnp.median(moved, axis=0)
     return positive(jnp.where(span >= _REST * moved, span, _MOVED * moved))

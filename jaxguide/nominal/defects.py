@@ -1,13 +1,27 @@
 """How far an extremal's polynomials miss its dynamics between the nodes."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxguide.bounds import largest_bound, overstep, positive, size_along
 from jaxguide.conditions.sizes import state_sizes
-from jaxguide.spectral import differentiation_matrix, interpolation_matrix, nodes_lg
+from jaxguide.spectral import (
+    differentiation_matrix,
+    interpolation_matrix,
+    legendre_matrix,
+    nodes_lg,
+)
 from jaxguide.trajectory import Extremal
+
+_ROUNDING = 1e-9  # a weight below it is that of a point which is no node of the quadrature
+# Share of the running cost with every state and control moved by its size, of which errors are
+# resolved at least: where the cost vanishes along the trajectory nothing else says how large it is.
+# Chosen, not tuned.
+_LEAST_COST = 1e-3
 
 
 def defects(
@@ -33,9 +47,46 @@ def defects(
 
 @eqx.filter_jit
 def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
-    """By segment, the integral of |dx/dt - f| between the nodes, relative to the state's span."""
+    """By segment, the largest of what its polynomials miss between the nodes, each relative to its
+    size:
+
+    - the integral of |dx/dt - f|, of each state;
+    - the running cost's integral against the quadrature by the nodes, relative to the whole
+      integral of |F|;
+    - by how much states and path constraints overstep their bounds.
+    """
+    problem, nodes = extremal.problem, extremal.reference_nodes
     gauss, weights = (jnp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * extremal.degree))
     half = jnp.diff(extremal.breaks) / 2
-    span = state_sizes(extremal.problem, extremal.t, extremal.x, extremal.u)
+    span = state_sizes(problem, extremal.t, extremal.x, extremal.u)
     gap = half[:, None] * jnp.einsum("g,sgk->sk", weights, jnp.abs(defects(extremal, gauss)))
-    return jnp.max(gap / span[None], axis=1)
+    parts = (
+        extremal.by_segment(extremal.t[:, None])[..., 0],
+        extremal.by_segment(extremal.x),
+        extremal.control_by_segment(),
+    )
+    between = interpolation_matrix(nodes, gauss)
+    at = tuple(jnp.einsum("gp,sp...->sg...", between, a) for a in parts)
+    over = lambda f, points: jax.vmap(jax.vmap(f))(*points)
+    cost, h = over(problem.running_cost, at), over(problem.path_constraints, at)
+    # Points that are no nodes of the quadrature have the weight zero.
+    own = 2 * legendre_matrix(nodes)[0]
+    known = jnp.where(jnp.abs(own) > _ROUNDING, over(problem.running_cost, parts), 0.0) @ own
+    missed = half * jnp.abs(cost @ weights - known)
+    whole = jnp.sum(half * (jnp.abs(cost) @ weights))
+    away = (at[0], at[1] + span, at[2] + size_along(extremal.u, problem.control_bounds))
+    away = jnp.abs(over(problem.running_cost, away))
+    least = _LEAST_COST * 2 * jnp.sum(half) * jnp.median(jnp.where(jnp.isfinite(away), away, 0.0))
+    missed = missed / positive(jnp.maximum(whole, least))
+    state = overstep(at[1], problem.state_bounds) / span
+    path = overstep(h, problem.path_bounds) / _path_sizes(h, problem.path_bounds)
+    worst = lambda a: jnp.max(a, axis=(1, 2), initial=0.0)
+    return jnp.max(
+        jnp.stack([jnp.max(gap / span, axis=1), missed, worst(state), worst(path)]), axis=0
+    )
+
+
+def _path_sizes(h: Float[Array, "segment point p"], bounds: Any) -> Float[Array, " p"]:
+    """The range of each path constraint along the trajectory, or its largest bound."""
+    span = jnp.max(h, axis=(0, 1)) - jnp.min(h, axis=(0, 1))
+    return positive(jnp.maximum(span, largest_bound(bounds, h.shape[2])))

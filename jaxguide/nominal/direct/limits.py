@@ -120,6 +120,8 @@ def _on_arcs(
     assert program.arcwise is not None
     at = program.arcwise.held[:, None]
     u = [xp.where(at > 0, u[1], u[0]), xp.where(at < 0, u[0], u[1])]
+    loose = xp.split(program.arcwise.loose, 2, axis=1)
+    u = [xp.where(a, side, b) for a, side, b in zip(loose, (-xp.inf, xp.inf), u, strict=True)]
     inner, last = xp.split(program.arcwise.released, 2, axis=1)
     free = xp.concatenate([xp.repeat(inner, program.counts.after - 1, axis=1), last], axis=1)
     x = [xp.where(free, side, b) for side, b in zip((-xp.inf, xp.inf), x, strict=True)]

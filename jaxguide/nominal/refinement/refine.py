@@ -12,7 +12,15 @@ import numpy as np
 
 from jaxguide.nominal.defects import segment_errors
 from jaxguide.nominal.refinement.arcs import Arcs, arcs
-from jaxguide.nominal.refinement.meshes import MeshStep, fractions_of, moved, remeshed, tails
+from jaxguide.nominal.refinement.marks import marks_of
+from jaxguide.nominal.refinement.meshes import (
+    MeshStep,
+    fractions_of,
+    moved,
+    remeshed,
+    tails,
+    united,
+)
 from jaxguide.nominal.refinement.structured import EXACT, RIGHT, WRONG, structured
 from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
@@ -24,6 +32,10 @@ _MOST_NODES, _MOST_SEGMENTS = 14, 96
 _MOST_MOVES = 6  # of the breaks of one size of mesh: more helped on no problem of the library
 _ATTEMPTS = 3  # meshes on which a structure is looked for
 
+_MOST_LOOKS = 6  # for kinks and touching points: each leaves the square of their displacement
+_MOVED = "breaks moved"
+_NONE = np.zeros(0)
+
 
 class _Standing(NamedTuple):
     """Where refinement stands.
@@ -31,6 +43,8 @@ class _Standing(NamedTuple):
     `method`: with the mesh last solved on; `mesh`: the method whose mesh `extremal`, the best so
     far, is on. `worst`: the error when breaks last moved on a mesh of this size, `moves` times;
     `raised`: how often the mesh was enlarged; `tried`: on which of these a structure was tried.
+    `given`: breaks that the user gave, as fractions; `marks`: those at kinks and touching points,
+    found `looked` times.
     """
 
     method: Any
@@ -40,6 +54,14 @@ class _Standing(NamedTuple):
     moves: int = 0
     raised: int = 0
     tried: int = -1
+    given: np.ndarray = _NONE
+    marks: np.ndarray = _NONE
+    looked: int = 0
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """Breaks that stay where they are."""
+        return np.unique(np.concatenate([self.given, self.marks]))
 
 
 class _View(NamedTuple):
@@ -49,6 +71,7 @@ class _View(NamedTuple):
     arcs: Arcs
     resolved: bool  # errors below the mesh tolerance
     smooth: bool  # no junctions, and room for more nodes
+    marks: np.ndarray  # breaks wanted at kinks and touching points, where they are not yet
     move: bool  # breaks may move once more, which costs no compilation, for as long as it helps
 
 
@@ -59,6 +82,7 @@ class _Next(NamedTuple):
     segments: int
     nodes: int
     standing: _Standing
+    fractions: np.ndarray | None = None  # where the breaks are; by default where the errors are
 
 
 def refined(
@@ -86,7 +110,8 @@ def refined(
         return last
 
     hear(MeshStep("first mesh", extremal, _error(extremal)))
-    at, candidate, doubt = _Standing(method, method, extremal), None, np.inf
+    given = _NONE if method.fractions is None else np.asarray(method.fractions, float)[1:-1]
+    at, candidate, doubt = _Standing(method, method, extremal, given=given), None, np.inf
     while True:
         errors = np.asarray(segment_errors(at.extremal))
         if not succeeded(at.extremal.result) or not np.all(np.isfinite(errors)):
@@ -95,7 +120,7 @@ def refined(
         view = _viewed(at, errors)
         if _may_be_structured(at, view):
             at = at._replace(tried=at.raised)
-            exact, wrong = structured(method, problem, at.extremal, view.arcs, hear)
+            exact, wrong = structured(method, problem, at.extremal, view.arcs, at.fixed, hear)
             if wrong <= RIGHT:
                 count = len(view.arcs.junctions)
                 return stopped(f"the structure is clear: {count} junctions", exact)
@@ -123,7 +148,12 @@ def _viewed(at: _Standing, errors: np.ndarray) -> _View:
     resolved = bool(errors.max() <= at.method.mesh_tolerance)
     smooth = not len(found.junctions) and at.method.nodes < _MOST_NODES
     move = not (smooth and resolved) and at.moves < _MOST_MOVES
-    return _View(errors, found, resolved, smooth, move and bool(errors.max() < 0.5 * at.worst))
+    marks = _NONE
+    if not resolved and at.looked < _MOST_LOOKS:
+        marks = marks_of(at.extremal, errors, at.method.mesh_tolerance)
+    return _View(
+        errors, found, resolved, smooth, marks, move and bool(errors.max() < 0.5 * at.worst)
+    )
 
 
 def _may_be_structured(at: _Standing, view: _View) -> bool:
@@ -141,9 +171,11 @@ def _next_mesh(at: _Standing, view: _View) -> _Next | str:
     if view.resolved and float(tails(at.extremal)) <= method.mesh_tolerance:
         return "states and costates resolved"
     segments = len(at.extremal.breaks) - 1
+    if len(view.marks):
+        return _marked(at, view)
     if view.move:
         again = at._replace(worst=view.errors.max(), moves=at.moves + 1)
-        return _Next("breaks moved", segments, method.nodes, again)
+        return _Next(_MOVED, segments, method.nodes, again)
     if at.raised == method.refinements:
         return f"{short} after {at.raised} refinements"
     larger = at._replace(worst=np.inf, moves=0, raised=at.raised + 1)
@@ -154,12 +186,30 @@ def _next_mesh(at: _Standing, view: _View) -> _Next | str:
     return f"{short} on the largest mesh"
 
 
+def _marked(at: _Standing, view: _View) -> _Next:
+    """The mesh with breaks at kinks and touching points. One found again nearby replaces the last
+    estimate of it."""
+    fractions = fractions_of(at.extremal)
+    # Less than half a segment away it is the same one.
+    half = np.interp(at.marks, (fractions[1:] + fractions[:-1]) / 2, np.diff(fractions) / 2)
+    far = np.abs(at.marks[:, None] - view.marks[None]).min(axis=1, initial=np.inf) > half
+    own = fractions[np.isin(fractions, at.marks[~far], invert=True)]
+    marks = np.union1d(at.marks[far], view.marks)
+    standing = at._replace(marks=marks, looked=at.looked + 1, worst=np.inf)
+    mesh = united(own, standing.fixed)
+    return _Next(
+        "breaks at kinks and touching points", len(mesh) - 1, at.method.nodes, standing, mesh
+    )
+
+
 def _taken(
     following: _Next, problem: Problem, errors: np.ndarray, hear: Callable[[MeshStep], None]
 ) -> tuple[_Standing, bool]:
     """Where refinement stands after the next mesh, and whether that was solved."""
     at = following.standing
-    fractions = moved(fractions_of(at.extremal), errors, following.segments)
+    fractions = following.fractions
+    if fractions is None:
+        fractions = moved(fractions_of(at.extremal), errors, following.segments, at.fixed)
     method = remeshed(at.method, fractions, following.nodes)
     better = method.run(problem, at.extremal)
     error = _error(better)
@@ -167,7 +217,7 @@ def _taken(
     if not succeeded(better.result):
         return at, False
     at = at._replace(method=method)
-    if error < errors.max() or following.step != "breaks moved":
+    if error < errors.max() or following.step != _MOVED:
         at = at._replace(extremal=better, mesh=method)
     return at, True
 
