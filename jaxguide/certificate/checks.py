@@ -12,7 +12,7 @@ from jaxtyping import Array
 from jaxguide.bounds import bound_size, overstep, slackness
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Checks
-from jaxguide.conditions.bounded import bound_errors
+from jaxguide.conditions.bounded import bound_errors, oversteps
 from jaxguide.conditions.hamiltonian import (
     constrained_hamiltonian,
     endpoint_lagrangian,
@@ -137,15 +137,21 @@ def stationarity(rows: Checks, a: Along, tight: float) -> None:
 
 
 def bounds(rows: Checks, a: Along, tight: float) -> None:
-    """Path constraints, states and controls within bounds, and the signs of their covectors."""
+    """Path constraints, states and controls within bounds, and the signs of their covectors. Path
+    constraints and states are looked at between the nodes too; a control is flown within its
+    bounds (`Extremal.__call__`)."""
     extremal, problem, t = a.extremal, a.extremal.problem, a.extremal.t
     m = extremal.multipliers
     covectors = (m.path, m.state, m.control)
     found = bound_errors(problem, t, extremal.x, extremal.u, covectors, a.size)
     paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
-    rows.add("path constraints", paths, found.path, t, tight)
-    rows.add("state bounds", states, found.state, t, tight)
+    flat = lambda values: values.reshape(-1, *values.shape[2:])
+    times, x, u = (flat(values) for values in a.between[:3])
+    path, state, _ = oversteps(problem, times, x, u, a.size)
+    both, times = lambda at, between: jnp.concatenate([at, between]), jnp.concatenate([t, times])
+    rows.add("path constraints", paths, both(found.path, path), times, tight)
+    rows.add("state bounds", states, both(found.state, state), times, tight)
     rows.add("control bounds", controls, found.control, t, tight)
     rows.add("complementarity", paths + states + controls, found.complementarity, t, tight)
 

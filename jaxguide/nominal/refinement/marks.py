@@ -12,7 +12,7 @@ from jaxguide.bounds import bounds_of
 from jaxguide.host.compilation import compiled
 from jaxguide.problem import Problem
 from jaxguide.spectral import legendre_matrix
-from jaxguide.spectral.grids import evaluation
+from jaxguide.spectral.grids import capacity_weights, differentiation, evaluation
 from jaxguide.trajectory import Extremal
 
 _POINTS = (
@@ -66,6 +66,32 @@ def marks_of(
         return fractions
     apart = np.append(True, np.diff(fractions) > _SAME)
     return fractions[apart & (fractions > _SAME) & (fractions < 1 - _SAME)]
+
+
+def settled(extremal: Extremal, marks: Float[np.ndarray, " mark"]) -> Float[np.ndarray, " mark"]:
+    """`marks`, breaks of `extremal` as fractions, those at which a state or path constraint touches
+    its bound moved to where its derivative vanishes: by Newton's method, one step."""
+    problem, breaks, out = extremal.problem, np.asarray(extremal.breaks), marks.copy()
+    nodes, horizon = np.asarray(extremal.reference_nodes), breaks[-1] - breaks[0]
+    at = np.searchsorted(breaks, breaks[0] + marks * horizon - _SAME * horizon)
+    sides = np.unique(np.concatenate([at - 1, at]))
+    samples = _sampled(extremal, sides, np.tile(nodes, (len(sides), 1)))
+    kinds = ((samples.x, problem.state_bounds), (samples.path, problem.path_bounds))
+    slope = differentiation(nodes, capacity_weights(nodes))
+    for values, bounds in kinds:
+        lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[2], float))
+        size = np.maximum(np.ptp(values, axis=(0, 1)), np.finfo(float).tiny)
+        near = np.minimum(values - lo, hi - values) / size < _RIDES
+        for j, k in enumerate(at):
+            left, right = np.searchsorted(sides, (k - 1, k))
+            for i in np.flatnonzero(near[left, -1] & ~near[left, -3] & ~near[right, 2]):
+                half = np.diff(breaks)[[k - 1, k]] / 2
+                once = [slope @ values[s, :, i] / h for s, h in zip((left, right), half)]
+                twice = [slope @ v / h for v, h in zip(once, half)]
+                curve = (twice[0][-1] + twice[1][0]) / 2
+                step = -(once[0][-1] + once[1][0]) / 2 / curve if curve else 0.0
+                out[j] = marks[j] + np.clip(step, *(np.array([-1, 1]) * half / 2)) / horizon
+    return out
 
 
 def _sampled(extremal: Extremal, segments: Any, tau: Float[np.ndarray, "segment k"]) -> _Samples:

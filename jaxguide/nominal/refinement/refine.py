@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxguide.nominal.defects import segment_errors
 from jaxguide.nominal.refinement.arcs import Arcs, arcs
-from jaxguide.nominal.refinement.marks import marks_of
+from jaxguide.nominal.refinement.marks import marks_of, settled
 from jaxguide.nominal.refinement.meshes import (
     MeshStep,
     fractions_of,
@@ -34,6 +34,7 @@ _ATTEMPTS = 3  # meshes on which a structure is looked for
 
 _MOST_LOOKS = 6  # for kinks and touching points: each leaves the square of their displacement
 _MOVED = "breaks moved"
+_SETTLED = 1e-8  # of the horizon: a touching point that moves less is found. Chosen, not tuned.
 _NONE = np.zeros(0)
 
 
@@ -149,8 +150,13 @@ def _viewed(at: _Standing, errors: np.ndarray) -> _View:
     smooth = not len(found.junctions) and at.method.nodes < _MOST_NODES
     move = not (smooth and resolved) and at.moves < _MOST_MOVES
     marks = _NONE
-    if not resolved and at.looked < _MOST_LOOKS:
-        marks = marks_of(at.extremal, errors, at.method.mesh_tolerance)
+    if at.looked < _MOST_LOOKS:
+        if not resolved:
+            marks = marks_of(at.extremal, errors, at.method.mesh_tolerance)
+        if len(at.marks) and not len(marks):
+            touching = settled(at.extremal, at.marks)
+            moves = np.abs(touching - at.marks) > _SETTLED
+            marks = touching[moves]
     return _View(
         errors, found, resolved, smooth, marks, move and bool(errors.max() < 0.5 * at.worst)
     )
