@@ -50,6 +50,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "families",
         "barycentric",
         "grids",
+        "extremes",
         "interpolation",
         "maps",
         "transforms",

@@ -12,14 +12,14 @@ from jaxtyping import Array
 from jaxguide.bounds import bound_size, overstep, slackness
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Checks
-from jaxguide.conditions.bounded import bound_errors, oversteps
+from jaxguide.conditions.bounded import bound_errors, oversteps_between
 from jaxguide.conditions.hamiltonian import (
     constrained_hamiltonian,
     endpoint_lagrangian,
     hamiltonian,
 )
 from jaxguide.problem import Problem, initial_bounds, initial_values, initially_free, is_free
-from jaxguide.spectral import legendre_matrix
+from jaxguide.spectral import legendre_matrix, nodes_lg
 
 
 def _costates(problem: Problem) -> tuple[str, ...]:
@@ -146,9 +146,10 @@ def bounds(rows: Checks, a: Along, tight: float) -> None:
     found = bound_errors(problem, t, extremal.x, extremal.u, covectors, a.size)
     paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
-    flat = lambda values: values.reshape(-1, *values.shape[2:])
-    times, x, u = (flat(values) for values in a.between[:3])
-    path, state, _ = oversteps(problem, times, x, u, a.size)
+    gauss, size = nodes_lg(2 * extremal.degree)[0], (a.size.path, a.size.x)
+    inside = oversteps_between(problem, gauss, a.between[:3], size)
+    path, state = (jnp.concatenate(over) for over in inside)
+    times = a.between[0].reshape(-1)
     both, times = lambda at, between: jnp.concatenate([at, between]), jnp.concatenate([t, times])
     rows.add("path constraints", paths, both(found.path, path), times, tight)
     rows.add("state bounds", states, both(found.state, state), times, tight)

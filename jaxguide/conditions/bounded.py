@@ -7,11 +7,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.bounds import overstep, slackness
 from jaxguide.conditions.sizes import Sizes
 from jaxguide.problem import Problem
+from jaxguide.spectral import extremes_near
 
 
 class BoundErrors(NamedTuple):
@@ -35,6 +38,27 @@ def oversteps(
     sizes."""
     path, state, control = (_over(*kind) for kind in _kinds(problem, t, x, u, size))
     return path, state, control
+
+
+def oversteps_between(
+    problem: Problem,
+    points: np.ndarray,
+    at: tuple[Array, Array, Array],
+    size: tuple[Array, Array],
+) -> tuple[Float[Array, "segment point p"], Float[Array, "segment point n"]]:
+    """By how much path constraints and states overstep their bounds near `points` of each segment,
+    the extremes between them included, relative to their sizes. `at`: times, states and controls
+    there, segment by segment; `size`: of path constraints and states."""
+    over_points = jax.vmap(jax.vmap(problem.path_constraints))
+    kinds = (
+        (over_points(*at), problem.path_bounds, size[0]),
+        (at[1], problem.state_bounds, size[1]),
+    )
+    path, state = (
+        xp.maximum(*(overstep(side, bounds) for side in extremes_near(points, values))) / of
+        for values, bounds, of in kinds
+    )
+    return path, state
 
 
 def _over(values: Float[Array, "node k"], bounds: Any, size: Array) -> Float[Array, "node k"]:

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxguide.bounds import largest_bound, overstep, positive, size_along
+from jaxguide.bounds import largest_bound, positive, size_along
+from jaxguide.conditions.bounded import oversteps_between
 from jaxguide.conditions.sizes import state_sizes
 from jaxguide.spectral import (
     differentiation_matrix,
@@ -68,7 +69,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     between = interpolation_matrix(nodes, gauss)
     at = tuple(jnp.einsum("gp,sp...->sg...", between, a) for a in parts)
     over = lambda f, points: jax.vmap(jax.vmap(f))(*points)
-    cost, h = over(problem.running_cost, at), over(problem.path_constraints, at)
+    cost = over(problem.running_cost, at)
     # Points that are no nodes of the quadrature have the weight zero.
     own = 2 * legendre_matrix(nodes)[0]
     known = jnp.where(jnp.abs(own) > _ROUNDING, over(problem.running_cost, parts), 0.0) @ own
@@ -78,8 +79,9 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     away = jnp.abs(over(problem.running_cost, away))
     least = _LEAST_COST * 2 * jnp.sum(half) * jnp.median(jnp.where(jnp.isfinite(away), away, 0.0))
     missed = missed / positive(jnp.maximum(whole, least))
-    state = overstep(at[1], problem.state_bounds) / span
-    path = overstep(h, problem.path_bounds) / _path_sizes(h, problem.path_bounds)
+    h = over(problem.path_constraints, at)
+    sizes = (_path_sizes(h, problem.path_bounds), span)
+    path, state = oversteps_between(problem, nodes_lg(2 * extremal.degree)[0], at, sizes)
     worst = lambda a: jnp.max(a, axis=(1, 2), initial=0.0)
     return jnp.max(
         jnp.stack([jnp.max(gap / span, axis=1), missed, worst(state), worst(path)]), axis=0
