@@ -78,6 +78,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "points",
         "transcription",
         "trees",
+        "implied",
         "limits",
         "box",
         "newton_system",

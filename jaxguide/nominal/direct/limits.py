@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxguide.arrays import Array, on_numpy, traced_once, xp
+from jaxguide.arrays import Array, on_numpy, put, traced_once, xp
 from jaxguide.bounds import bounds_of
+from jaxguide.nominal.direct.implied import implied_at_ends, may_be_implied
 from jaxguide.nominal.direct.transcription import Transcription
 from jaxguide.nominal.direct.unknowns import Primal
 from jaxguide.problem import (
@@ -51,6 +52,8 @@ def limits_of(program: Transcription) -> Limits:
     h = [over(b / scale.path, counts.segments, counts.nodes) for b in path]
     if program.arcwise is not None:
         x, u, h = _on_arcs(program, x, u, h)
+    if may_be_implied(program.problem):
+        x, h = _without_implied(program, x, h)
 
     def side(i: int) -> Primal:
         return Primal(
@@ -110,6 +113,26 @@ def _time_bounds(problem: Problem, clocks: int) -> list[_Side]:
     if is_free(problem.initial_time) and not is_free(problem.final_time):
         times[0] = (times[0][0], jnp.minimum(times[0][1], times[1][0]))
     return times + [(number(-jnp.inf), number(jnp.inf))] * (clocks - 2)
+
+
+def _without_implied(
+    program: Transcription, x: list[Array], h: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """Bounds of states and path constraints, less those at the ends that other conditions imply."""
+    found = implied_at_ends(program.problem)
+    if on_numpy(program.edges):
+        found = jax.device_get(found)
+    nodes, sides = program.rule.nodes, (-xp.inf, xp.inf)
+    free = lambda b, at, which, side: put(b, at, xp.where(which, side, b[at]))
+    x = [free(b, np.s_[-1, -1], found.state, s) for b, s in zip(x, sides, strict=True)]
+    ends = (
+        (nodes[0] == -1.0, np.s_[0, 0], found.first),
+        (nodes[-1] == 1.0, np.s_[-1, -1], found.last),
+    )
+    for is_node, at, which in ends:
+        if is_node:
+            h = [free(b, at, which, s) for b, s in zip(h, sides, strict=True)]
+    return x, h
 
 
 def _on_arcs(

@@ -5,8 +5,9 @@ points at which a state or path constraint just touches its bound. Breaks belong
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxguide.bounds import bounds_of
 from jaxguide.host.compilation import compiled
@@ -39,6 +40,7 @@ class _Samples(NamedTuple):
     x: Float[np.ndarray, "segment point n"]
     functions: Float[np.ndarray, "segment point function"]  # dynamics, running cost
     path: Float[np.ndarray, "segment point p"]
+    steered: Bool[np.ndarray, " p"]  # path constraints that depend on a control
 
 
 def marks_of(
@@ -76,7 +78,10 @@ def settled(extremal: Extremal, marks: Float[np.ndarray, " mark"]) -> Float[np.n
     at = np.searchsorted(breaks, breaks[0] + marks * horizon - _SAME * horizon)
     sides = np.unique(np.concatenate([at - 1, at]))
     samples = _sampled(extremal, sides, np.tile(nodes, (len(sides), 1)))
-    kinds = ((samples.x, problem.state_bounds), (samples.path, problem.path_bounds))
+    kinds = (
+        (samples.x, problem.state_bounds),
+        (np.where(samples.steered, np.nan, samples.path), problem.path_bounds),
+    )
     slope = differentiation(nodes, capacity_weights(nodes))
     for values, bounds in kinds:
         lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[2], float))
@@ -108,8 +113,8 @@ def _sampled(extremal: Extremal, segments: Any, tau: Float[np.ndarray, "segment 
         for k in range(0, len(flat[0]), _AT_ONCE)
     ]
     values = (np.concatenate(v)[: len(flat[0])] for v in zip(*jax.device_get(parts), strict=True))
-    functions, path = (v.reshape(*tau.shape, -1) for v in values)
-    return _Samples(tau, x, functions, path)
+    functions, path, other = (v.reshape(*tau.shape, -1) for v in values)
+    return _Samples(tau, x, functions, path, np.any(path != other, axis=(0, 1)))
 
 
 def _filled(a: np.ndarray) -> np.ndarray:
@@ -117,12 +122,12 @@ def _filled(a: np.ndarray) -> np.ndarray:
     return np.concatenate([a, np.broadcast_to(a[-1:], (_AT_ONCE - len(a), *a.shape[1:]))])
 
 
-def _along(problem: Problem, t: Any, x: Any, u: Any) -> tuple[Any, Any]:
-    """Dynamics and running cost, and path constraints, at points of a trajectory."""
+def _along(problem: Problem, t: Any, x: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Dynamics and running cost, and path constraints, at points of a trajectory; these also for
+    other controls."""
     f, cost = jax.vmap(problem.dynamics)(t, x, u), jax.vmap(problem.running_cost)(t, x, u)
-    return jax.numpy.concatenate([f, cost[:, None]], axis=1), jax.vmap(problem.path_constraints)(
-        t, x, u
-    )
+    path = jax.vmap(problem.path_constraints)
+    return jnp.concatenate([f, cost[:, None]], axis=1), path(t, x, u), path(t, x, u + 1)
 
 
 def _kinks(extremal: Extremal, segments: Any, samples: _Samples) -> list[tuple[int, float]]:
@@ -184,10 +189,13 @@ def _touches(
     for between, at_nodes, bounds in kinds:
         if not between.shape[2]:
             continue
+        if between is samples.path:  # what a control can keep does not just touch
+            between = np.where(samples.steered, np.nan, between)
         lo, hi = (np.asarray(b) for b in bounds_of(bounds, between.shape[2], float))
         size = np.maximum(np.ptp(between, axis=(0, 1)), np.finfo(float).tiny)
         for values, nodes in ((lo - between, lo - at_nodes), (between - hi, at_nodes - hi)):
             over, riding = values / size, np.sum(nodes / size > -_RIDES, axis=1) > 2
+            over = np.where(np.isfinite(over), over, 0.0)
             k = np.argmax(over, axis=1)
             for row, i in zip(*np.nonzero(np.max(over, axis=1) > tolerance), strict=True):
                 j = k[row, i]
