@@ -147,7 +147,8 @@ def bounds(rows: Checks, a: Along, tight: float) -> None:
     paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
     gauss, size = nodes_lg(2 * extremal.degree)[0], (a.size.path, a.size.x)
-    inside = oversteps_between(problem, gauss, a.between[:3], size)
+    t_in, x_in, u_in = a.between[:3]
+    inside = oversteps_between(problem, gauss, (t_in, x_in, u_in), size)
     path, state = (jnp.concatenate(over) for over in inside)
     times = a.between[0].reshape(-1)
     both, times = lambda at, between: jnp.concatenate([at, between]), jnp.concatenate([t, times])

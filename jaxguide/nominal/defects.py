@@ -67,7 +67,8 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
         extremal.control_by_segment(),
     )
     between = interpolation_matrix(nodes, gauss)
-    at = tuple(jnp.einsum("gp,sp...->sg...", between, a) for a in parts)
+    t, x, u = (jnp.einsum("gp,sp...->sg...", between, a) for a in parts)
+    at = (t, x, u)
     over = lambda f, points: jax.vmap(jax.vmap(f))(*points)
     cost = over(problem.running_cost, at)
     # Points that are no nodes of the quadrature have the weight zero.
@@ -75,7 +76,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     known = jnp.where(jnp.abs(own) > _ROUNDING, over(problem.running_cost, parts), 0.0) @ own
     missed = half * jnp.abs(cost @ weights - known)
     whole = jnp.sum(half * (jnp.abs(cost) @ weights))
-    away = (at[0], at[1] + span, at[2] + size_along(extremal.u, problem.control_bounds))
+    away = (t, x + span, u + size_along(extremal.u, problem.control_bounds))
     away = jnp.abs(over(problem.running_cost, away))
     least = _LEAST_COST * 2 * jnp.sum(half) * jnp.median(jnp.where(jnp.isfinite(away), away, 0.0))
     missed = missed / positive(jnp.maximum(whole, least))
