@@ -79,6 +79,7 @@ if TYPE_CHECKING:
     from jaxguide.tuning.loop import tune as tune
     from jaxguide.types import RESULTS as RESULTS
     from jaxguide.types import SolveError as SolveError
+    from jaxguide.types import SolveWarning as SolveWarning
 
 __version__ = "0.1.0"
 
@@ -128,6 +129,7 @@ _HOME = {
     "Sensor": "flight.sensors",
     "Shooting": "nominal.indirect.shooting",
     "SolveError": "types",
+    "SolveWarning": "types",
     "StateAsTime": "transforms.state_as_time",
     "SuboptimalSchedule": "neighboring.suboptimal",
     "SuccessWithin": "sweeping.stopping",

@@ -40,8 +40,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "jg.Pseudospectral."
     )
     infeasible = (
-        "No trajectory meets the endpoint constraints: relax a constraint or a bound, or free a "
-        "component of the initial state or the final time."
+        "The search ended where the constraints are violated least nearby, which does not show "
+        "that no trajectory exists: give a `guess` or more `starts`, relax a constraint or a bound, or "
+        "free a component of the initial state or the final time."
     )
     bounds_violated = (
         "The extremal leaves state, control or path bounds, which shooting and "
@@ -53,8 +54,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "direct method."
     )
     underresolved = (
-        "The mesh does not resolve the solution to `mesh_tolerance`: raise `segments` or `nodes`, "
-        "solve outside a trace, which refines, or take it as it is with `refinements=0`."
+        "The mesh does not resolve the solution to `mesh_tolerance`: raise `segments`, `nodes` or "
+        "`refinements`, solve outside a trace, which refines, or take it as it is with "
+        "`refinements=0`."
     )
     gain_unresolved = (
         "The gain is not resolved at this time: raise `segments` or `nodes`, or stay further "
@@ -103,6 +105,12 @@ def succeeded(result: RESULTS) -> bool:
     return code(result) == code(RESULTS.successful)
 
 
+def usable(result: RESULTS) -> bool:
+    """Whether one result is success, or a solution that its mesh does not resolve to the tolerance.
+    Host only."""
+    return succeeded(result) or code(result) == code(RESULTS.underresolved)
+
+
 def message(number: int) -> str:
     """The name of a result stored by its `code`, or "code N" if there is none."""
     for name in RESULTS._name_to_item:  # pyright: ignore
@@ -123,6 +131,10 @@ class UnknownName(ValueError):
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}."
         super().__init__(f"no {kind} named {name!r}: {hint}")
+
+
+class SolveWarning(UserWarning):
+    """A solution is not all that was asked for; the message names what is worst and the remedy."""
 
 
 class SolveError(RuntimeError):

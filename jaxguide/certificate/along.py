@@ -13,10 +13,11 @@ from jaxguide.trajectory import Extremal
 
 
 class Evaluated(NamedTuple):
-    """At points of an extremal, "*k" of them: the dynamics; H with what the integrands add; the
-    gradients of H bar by (x, u, t); the integrands."""
+    """At points of an extremal, "*k" of them: the dynamics and path constraints; H with what the
+    integrands add; the gradients of H bar by (x, u, t); the integrands."""
 
     f: Float[Array, "*k n"]
+    path: Float[Array, "*k p"]
     hamiltonian: Float[Array, "*k"]
     by_x: Float[Array, "*k n"]
     by_u: Float[Array, "*k m"]
@@ -42,7 +43,7 @@ def hamiltonian_along(
     value = at.cost + xp.sum(costate * at.f, axis=1) + xp.sum(of_gain * gain, axis=1)
     back = lambda a: a.reshape(*lead, *a.shape[1:])
     by_x, by_u = slope[:, :n] + of_own[:, :n], slope[:, n : n + m] + of_own[:, n:]
-    return Evaluated(*map(back, (at.f, value, by_x, by_u, slope[:, -1], gain)))
+    return Evaluated(*map(back, (at.f, at.path, value, by_x, by_u, slope[:, -1], gain)))
 
 
 class Along:

@@ -14,7 +14,7 @@ from jaxguide.arrays import Array, eigvalsh, on_numpy, xp
 from jaxguide.bounds import bound_size, overstep, slackness
 from jaxguide.certificate.along import Along, hamiltonian_along
 from jaxguide.certificate.table import Checks
-from jaxguide.conditions.bounded import bound_errors
+from jaxguide.conditions.bounded import bound_errors, oversteps_between
 from jaxguide.conditions.hamiltonian import constrained_hamiltonian, endpoint_lagrangian
 from jaxguide.host.compilation import compiled
 from jaxguide.problem import (
@@ -26,6 +26,7 @@ from jaxguide.problem import (
     is_free,
 )
 from jaxguide.problem.points import control_curvature
+from jaxguide.spectral import nodes_lg
 from jaxguide.spectral.either import to_legendre
 
 
@@ -134,15 +135,24 @@ def stationarity(rows: Checks, a: Along, tight: float) -> None:
 
 
 def bounds(rows: Checks, a: Along, tight: float) -> None:
-    """Path constraints, states and controls within bounds, and the signs of their covectors."""
+    """Path constraints, states and controls within bounds, and the signs of their covectors. Path
+    constraints and states are looked at between the nodes too; a control is flown within its
+    bounds (`Extremal.__call__`)."""
     extremal, problem, t = a.extremal, a.extremal.problem, a.extremal.t
     m = extremal.multipliers
     covectors = (m.path, m.state, m.control)
     found = bound_errors(extremal.stated, t, extremal.x, extremal.u, covectors, a.size)
     paths = tuple(f"path {i}" for i in range(found.path.shape[1]))
     states, controls = problem.state_names, problem.control_names
-    rows.add("path constraints", paths, found.path, t, tight)
-    rows.add("state bounds", states, found.state, t, tight)
+    h, (times, x, _, _, _), size = a.at_gauss.path, a.between, (a.size.path, a.size.x)
+    inside = oversteps_between(problem, nodes_lg(2 * extremal.degree)[0], (h, x), size)
+    path, state = (over.reshape(-1, over.shape[2]) for over in inside)
+    both, times = (
+        lambda at, over: xp.concatenate([at, over]),
+        xp.concatenate([t, times.reshape(-1)]),
+    )
+    rows.add("path constraints", paths, both(found.path, path), times, tight)
+    rows.add("state bounds", states, both(found.state, state), times, tight)
     rows.add("control bounds", controls, found.control, t, tight)
     rows.add("complementarity", paths + states + controls, found.complementarity, t, tight)
 

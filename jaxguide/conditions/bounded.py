@@ -5,6 +5,7 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxguide.arrays import Array, xp
@@ -12,6 +13,7 @@ from jaxguide.bounds import overstep, slackness
 from jaxguide.conditions.sizes import Sizes
 from jaxguide.problem import Problem
 from jaxguide.problem.points import rates
+from jaxguide.spectral import extremes_near
 
 
 class BoundErrors(NamedTuple):
@@ -35,6 +37,23 @@ def oversteps(
     sizes."""
     path, state, control = (_over(*kind) for kind in _kinds(problem, t, x, u, size))
     return path, state, control
+
+
+def oversteps_between(
+    problem: Problem,
+    points: np.ndarray,
+    at: tuple[Float[Array, "segment point p"], Float[Array, "segment point n"]],
+    size: tuple[Array, Array],
+) -> tuple[Float[Array, "segment point p"], Float[Array, "segment point n"]]:
+    """By how much path constraints and states overstep their bounds near `points` of each segment,
+    the extremes between them included, relative to their sizes. `at`: path constraints and states
+    there, segment by segment; `size`: of both."""
+    bounds = (problem.path_bounds, problem.state_bounds)
+    path, state = (
+        xp.maximum(*(overstep(side, within) for side in extremes_near(points, values))) / of
+        for values, within, of in zip(at, bounds, size, strict=True)
+    )
+    return path, state
 
 
 def _over(values: Float[Array, "node k"], bounds: Any, size: Array) -> Float[Array, "node k"]:

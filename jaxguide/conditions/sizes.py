@@ -6,12 +6,16 @@ from jaxtyping import Float
 
 from jaxguide.arrays import Array, xp
 from jaxguide.bounds import largest_bound, positive, size_along
+from jaxguide.conditions.units import natural_units
 from jaxguide.problem import Problem
 from jaxguide.problem.points import EndSlopes, end_slopes, integrand_slopes, slopes
 
 # A state is at rest if it stays below `_REST` of the distance by which its rate, with all terms of
 # one sign, could move it over the horizon; its size is then `_MOVED` of that. By experiment.
 _REST, _MOVED = 1e-6, 1e-3
+# Share of its natural unit below which a state or control is what the optimiser's tolerance, 1e-9
+# of such units, leaves of zero.
+_NOISE = 1e-9
 # Share of the largest terms of H that is added to its size: H may vanish because they cancel, and
 # errors must be relative to something. Chosen, no experiment is recorded.
 _TERMS = 1e-3
@@ -53,7 +57,7 @@ def sizes_of(
     horizon = t[-1] - t[0]
     u_size = size_along(u, problem.control_bounds)
     at = slopes(problem, t, x, u)
-    x_size = _state_sizes(at.f_by, t, x, u)
+    x_size = _state_sizes(problem, at.f_by, t, x, u)
     z = xp.concatenate([x_size, u_size])
     path = xp.max(_known(at.path_by[:, :, :-1]) @ z, axis=0, initial=0.0)
     path = xp.maximum(path, largest_bound(problem.path_bounds, path.shape[0]))
@@ -98,13 +102,18 @@ def state_sizes(
     x: Float[Array, "node n"],
     u: Float[Array, "node m"],
 ) -> Float[Array, " n"]:
-    """Sizes of the states: see `sizes_of`."""
-    return _state_sizes(slopes(problem, t, x, u).f_by, t, x, u)
+    """Sizes of the states: see `sizes_of`. States and controls that are nothing but rounding count
+    as large as their natural units where they move others."""
+    return _state_sizes(problem, slopes(problem, t, x, u).f_by, t, x, u)
 
 
-def _state_sizes(f_by: Array, t: Array, x: Array, u: Array) -> Float[Array, " n"]:
+def _state_sizes(problem: Problem, f_by: Array, t: Array, x: Array, u: Array) -> Float[Array, " n"]:
     span, most = xp.max(xp.abs(x), axis=0), xp.max(xp.abs(u), axis=0)
-    moved = _known(f_by[:, :, :-1]) @ xp.concatenate([span, most])
+    times = xp.stack([t[0], t[-1]])
+    x_unit, u_unit = natural_units(problem, times, x[0], x[1:, None], u[1:, None])
+    x_known = xp.where(span > _NOISE * x_unit, span, x_unit)
+    u_known = xp.where(most > _NOISE * u_unit, most, u_unit)
+    moved = _known(f_by[:, :, :-1]) @ xp.concatenate([x_known, u_known])
     # The median: at the end of an infinite horizon rates grow beyond all bounds.
     moved = (t[-1] - t[0]) * xp.median(moved, axis=0)
     return positive(xp.where(span >= _REST * moved, span, _MOVED * moved))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxguide.bounds import bounds_of, overstep
+from jaxguide.certificate import Certified
 from jaxguide.nominal.defects import defects
 from jaxguide.problem import initially_free
 from jaxguide.trajectory import Extremal
@@ -28,6 +29,22 @@ def why(extremal: Extremal) -> str:
         sentences += [text for size, text in misses[:2] if size > _NEGLIGIBLE]
     sentences.append(f"Largest scaled residual {float(extremal.residual):.2e}.")
     return " ".join(sentences)
+
+
+def shortfall(extremal: Certified) -> str:
+    """How far a solution is from what was asked: the worst row of its certificate, and the
+    remedy."""
+    rows = extremal.certificate.rows()
+    # 1e-300: rows with the bound 0 are not divided by it.
+    worst = max(
+        rows, key=lambda r: np.nan_to_num(r["value"], nan=np.inf) / max(r["tolerance"], 1e-300)
+    )
+    where = f" of {worst['where']}" if worst["where"] else ""
+    return (
+        f"{type(extremal.problem).__name__}: {RESULTS[extremal.result]} Worst in its certificate: "
+        f"{worst['check']}{where}, {worst['value']:.2e} at t = {worst['time']:.6g}, where "
+        f"{worst['tolerance']:.1e} passes."
+    )
 
 
 def _undefined(extremal: Extremal) -> str:

@@ -1,5 +1,6 @@
 """`jg.solve`: from a Problem to a certified Extremal."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,11 +14,11 @@ from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.method import Method, called
 from jaxguide.nominal.refinement.ladder import on_meshes
 from jaxguide.problem import Problem
-from jaxguide.solving.diagnosis import why
+from jaxguide.solving.diagnosis import shortfall, why
 from jaxguide.solving.given import Given, default_method, given
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import opened
-from jaxguide.types import SolveError, require_x64, succeeded
+from jaxguide.types import SolveError, SolveWarning, require_x64, succeeded, usable
 
 
 def solve(
@@ -42,7 +43,8 @@ def solve(
       `jax.random.key` for a random start of a direct solve.
     - `watch`: called after each solve of a direct method's refinement with what it is and how
       good, such as `print`. Not under a trace.
-    - `throw`: raise if it fails. Under a trace nothing is raised; look at `.result`.
+    - `throw`: raise if it fails, and warn (`jg.SolveWarning`) if the solution is not resolved to
+      the method's `mesh_tolerance`. Under a trace neither; look at `.result`.
 
     **Raises:** `ValueError` for a badly stated problem, `RuntimeError` without float64,
     `SolveError` (with the worst constraint, by how much it is missed and what to try) when no
@@ -58,9 +60,12 @@ def solve(
             by, extremal = _found(start, watch, Pseudospectral() if method is None else None)
         extremal = on_device(extremal)
     extremal = opened(extremal)
+    done = certified(extremal, by.accuracy)
     if throw and not start.traced:
         raise_if_failed(extremal)
-    return certified(extremal, by.accuracy)
+        if not succeeded(extremal.result):
+            warnings.warn(shortfall(done), SolveWarning, stacklevel=2)
+    return done
 
 
 # The solve under a trace, pure; compiled whole, because a bare `jax.grad` would run it operation by
@@ -82,7 +87,7 @@ def _found(start: Given, watch: Any, otherwise: Method | None) -> tuple[Method, 
             return method, extremal
         method, guess = fallback, None
     extremal = on_meshes(method, problem, guess, watch)
-    if fallback is not None and succeeded(extremal.result):
+    if fallback is not None and usable(extremal.result):
         polished = start.method.run(problem, extremal)
         if succeeded(polished.result):
             return start.method, polished
@@ -90,6 +95,6 @@ def _found(start: Given, watch: Any, otherwise: Method | None) -> tuple[Method, 
 
 
 def raise_if_failed(extremal: Extremal) -> None:
-    """Raises `SolveError` unless `extremal.result` is success, naming the worst miss. Host only."""
-    if not succeeded(extremal.result):
+    """Raises `SolveError` unless there is a solution, naming the worst miss. Host only."""
+    if not usable(extremal.result):
         raise SolveError(why(extremal))

@@ -3,6 +3,7 @@
 from jaxguide.spectral.barycentric import barycentric_weights as barycentric_weights
 from jaxguide.spectral.barycentric import differentiation_matrix as differentiation_matrix
 from jaxguide.spectral.barycentric import interpolation_matrix as interpolation_matrix
+from jaxguide.spectral.extremes import extremes_near as extremes_near
 from jaxguide.spectral.families import FAMILIES as FAMILIES
 from jaxguide.spectral.families import NodeFamily as NodeFamily
 from jaxguide.spectral.families import node_family as node_family

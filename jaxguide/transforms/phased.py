@@ -162,8 +162,8 @@ class Phased(Problem):
     @property
     def endpoint_bounds(self) -> tuple[Array, Array]:
         own = self._joined("endpoint_bounds", [endpoint_count(p) for p in self.phases])
-        zero = np.zeros(self._links_count(), own[0].dtype)
-        last = np.full(len(self.phases), np.inf, own[0].dtype)
+        zero: Any = np.zeros(self._links_count(), own[0].dtype)
+        last: Any = np.full(len(self.phases), np.inf, own[0].dtype)
         return _join([own, (zero, zero), (np.zeros_like(last), last)])
 
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:

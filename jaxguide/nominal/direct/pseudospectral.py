@@ -262,6 +262,7 @@ class Pseudospectral(Method):
             more(known.smooth, whole.m),
             more(known.released, whole.n),
             known.unpathed,
+            more(known.loose, whole.m),
         )
 
     def prepared(

@@ -75,12 +75,15 @@ class Arcwise(eqx.Module):
     - `released`: states whose bounds are implied by controls held, so that their multipliers would
       be arbitrary; for the inner points of a segment, and for its last point.
     - `unpathed`: likewise path constraints.
+    - `loose`: controls whose lower and upper bound is left out, because the segment ends where they
+      meet it: there a barrier would hold them away.
     """
 
     held: Float[Array, "segment m"]
     smooth: Float[Array, "segment m"]
     released: Bool[Array, "segment two n"]
     unpathed: Bool[Array, "segment h"]
+    loose: Bool[Array, "segment two m"]
 
     @classmethod
     def blank(cls, segments: int, problem: Problem) -> "Arcwise":
@@ -88,5 +91,6 @@ class Arcwise(eqx.Module):
         zero = xp.zeros((segments, problem.m), jnp.result_type(float))
         released = xp.zeros((segments, 2, problem.n), bool)
         return cls(
-            zero, zero, released, xp.zeros((segments, count(problem, "path_constraints")), bool)
-        )
+            zero, zero, released, xp.zeros((segments, count(problem, "path_constraints")), bool),
+            xp.zeros((segments, 2, problem.m), bool),
+        )  # fmt: skip

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxguide.bounds import bounds_of
 from jaxguide.problem.points import rates
@@ -22,6 +22,10 @@ _SAME = 1e-12  # a range below this share of the largest value is rounding: the 
 _LEAST, _SHARE = 2, 2e-3
 # An arc that free knots made shorter than this share of the horizon is gone. Knots keep 1e-6 apart.
 _CLOSED = 1e-5
+_WEIGHTLESS = 1e-9  # a weight below it is that of a point which is no node of the quadrature
+# How far beyond its segment, in half lengths of it, a multiplier's polynomial is trusted to show
+# its zero. A choice: at 2 a polynomial of degree 11 has lost some six digits.
+_FURTHEST = 2.0
 # A multiplier of the wrong sign below this share of its control's largest is the error that a
 # junction leaves at its neighbouring nodes. By experiment on NPSAT1 and the robot arm.
 _ROUNDING = 1e-7
@@ -38,12 +42,21 @@ class Arcs(NamedTuple):
         """Which junctions are of the `m` controls, the first components."""
         return np.any(np.diff(self.active[:, :m], axis=0), axis=1)
 
+    def kinks(self, affine: Bool[np.ndarray, " m"]) -> Bool[np.ndarray, " junction"]:
+        """Which junctions are of controls that meet or leave a bound with a kink: all that change
+        there do, and H is not linear in any of them (`affine` says in which it is), so that its
+        minimiser is continuous."""
+        before, after = self.active[:-1, : len(affine)], self.active[1:, : len(affine)]
+        changed = before != after
+        jumps = changed & (affine[None] | (before * after != 0))
+        return np.any(changed, axis=1) & ~np.any(jumps, axis=1)
+
 
 def arcs(extremal: Extremal) -> Arcs:
     """The active sets along `extremal`, from its nodes."""
     problem = extremal.problem
     # Points that are no nodes of the quadrature hold extrapolated controls.
-    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > 1e-9
+    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > _WEIGHTLESS
     t = extremal.by_segment(extremal.t[:, None])[..., 0]
     x, u = extremal.by_segment(extremal.x), extremal.control_by_segment()
     flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
@@ -78,10 +91,57 @@ def without_collapsed(found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
     return Arcs(np.array(middle), found.active[first])
 
 
-def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]) -> Arcs:
+def meeting_points(
+    extremal: Extremal, found: Arcs, edges: Int[np.ndarray, " end"], kinks: Bool[np.ndarray, " j"]
+) -> Float[np.ndarray, " junction"]:
+    """Times at which the controls meet the bounds that `found` holds them on, for its junctions
+    that are `kinks`; the others where they are. `edges`: the arcs' ends among the breaks.
+
+    There the multiplier of the bound, -H_u, vanishes along the states and costates of the arc that
+    is held. The zero of its polynomial errs by the square of the junction's present error: an arc
+    too long by d has a control that is wrong by a multiple of d over a time of d.
+    """
+    breaks, out = np.asarray(extremal.breaks), found.junctions.copy()
+    multiplier = np.asarray(extremal.by_segment(extremal.multipliers.control))
+    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > _WEIGHTLESS
+    tau = np.asarray(extremal.reference_nodes)[own]
+    m = multiplier.shape[2]
+    for j in np.flatnonzero(kinks):
+        before, after, moves = found.active[j, :m], found.active[j + 1, :m], []
+        for k in np.flatnonzero(before != after):
+            s, end = (edges[j + 1] - 1, 1.0) if before[k] else (edges[j + 1], -1.0)
+            half = (breaks[s + 1] - breaks[s]) / 2
+            series = np.polynomial.Legendre.fit(tau, multiplier[s, own, k], len(tau) - 1, [-1, 1])
+            moves.append(half * _nearest_zero(series, end))
+        move = moves[int(np.argmax(np.abs(moves)))]
+        ahead, behind = breaks[edges[j + 2]] - out[j], out[j] - breaks[edges[j]]
+        out[j] += np.clip(move, -behind, ahead)
+    return out
+
+
+def _nearest_zero(series: Any, end: float) -> float:
+    """How far from `end` the polynomial `series` has its nearest zero, at most `_FURTHEST`; where
+    it has none so near, as far as its tangent at the end says."""
+    roots = series.roots()
+    real = roots.real[np.abs(roots.imag) <= _SAME + 1e-9 * np.abs(roots.real)] - end
+    near = real[np.abs(real) <= _FURTHEST]
+    if len(near):
+        return float(near[np.argmin(np.abs(near))])
+    slope = float(series.deriv()(end))
+    step = -float(series(end)) / slope if slope else 0.0
+    return float(np.clip(step, -_FURTHEST, _FURTHEST))
+
+
+def corrected(
+    extremal: Extremal,
+    found: Arcs,
+    edges: Float[np.ndarray, " edge"],
+    affine: Bool[np.ndarray, " m"],
+) -> Arcs:
     """`found`, its arcs at `edges` (ends included), corrected by the multipliers of the controls: a
-    control held at one bound goes to the other where the sign of its multiplier says so. Two
-    controls that one junction switches together then switch each at its own multiplier's zero."""
+    control held at one bound goes to the other where the sign of its multiplier says so, or leaves
+    both unless H is linear in it (`affine`). Two controls that one junction switches together then
+    switch each at its own multiplier's zero."""
     problem, m = extremal.problem, extremal.problem.m
     nodal = (extremal.t, extremal.x, extremal.u, extremal.multipliers.control)
     t = _own(extremal, extremal.t)
@@ -91,7 +151,9 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
     arc = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(found.active) - 1)
     labels = found.active[arc].copy()
     clear = np.abs(multiplier) > _ROUNDING * np.max(np.abs(multiplier), axis=0)
-    held = np.where((labels[:, :m] != 0) & clear, np.sign(multiplier), labels[:, :m])
+    # Where H is not linear in the control, it leaves the bound for a value between.
+    other = np.where(affine | (np.sign(multiplier) == labels[:, :m]), np.sign(multiplier), 0)
+    held = np.where((labels[:, :m] != 0) & clear, other, labels[:, :m])
     changed = np.any(held != labels[:, :m], axis=1, keepdims=True)
     lo, hi = (np.asarray(b) for b in bounds_of(problem.control_bounds, m, u.dtype))
     u: Any = np.where(held > 0, hi, np.where(held < 0, lo, u))
@@ -105,7 +167,7 @@ def corrected(extremal: Extremal, found: Arcs, edges: Float[np.ndarray, " edge"]
 def _own(extremal: Extremal, values: Any) -> Any:
     """`values` (node, ...) at the nodes of the quadrature alone, segment after segment."""
     flat = values.reshape(values.shape[0], -1)
-    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > 1e-9
+    own = np.abs(to_legendre(extremal.reference_nodes)[0]) > _WEIGHTLESS
     by_segment = np.asarray(extremal.by_segment(flat))[:, own]
     return by_segment.reshape(-1, *values.shape[1:])
 

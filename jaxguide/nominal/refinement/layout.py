@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.refinement.arcs import Arcs
+from jaxguide.nominal.refinement.meshes import united
 from jaxguide.problem.points import control_curvature
 from jaxguide.trajectory import Extremal
 
@@ -14,6 +15,7 @@ _SEGMENTS_A_HORIZON = 8  # of the mesh with free knots: a first choice, tried on
 # Weight of a singular control's roughness, in designer units: a first choice, tried on Goddard's
 # rocket, Jackson's reactor and the catalyst mixing.
 _SMOOTHING = 1e2
+_SAME = 1e-9  # of the horizon: times that are one
 _LINEAR = 1e-12  # curvature of H, relative to H, below which it is linear in a control: rounding
 
 
@@ -27,19 +29,31 @@ class Layout(NamedTuple):
     arcwise: Arcwise
 
 
-def laid_out(extremal: Extremal, found: Arcs) -> Layout:
-    """A mesh for the arcs `found` along `extremal`."""
-    n, m, junctions = extremal.problem.n, extremal.problem.m, found.junctions
-    affine, switches = _affine(extremal), found.switches(m)
-    t0, tf = float(extremal.t[0]), float(extremal.t[-1])
-    main = (np.concatenate([[t0], junctions, [tf]]) - t0) / (tf - t0)
+def laid_out(
+    extremal: Extremal,
+    found: Arcs,
+    affine: Bool[np.ndarray, " m"],
+    inner: list[np.ndarray],
+    marks: Float[np.ndarray, " mark"],
+    loose: bool = False,
+) -> Layout:
+    """A mesh for the arcs `found` along `extremal`; `affine`: which controls H is linear in.
+
+    `inner`: the breaks of each arc, from 0 to 1 of it; `marks`: fractions of the horizon at which
+    there must be breaks besides. `loose`: whether controls that are on no bound have none, in
+    which H is not linear.
+    """
+    n, m = extremal.problem.n, extremal.problem.m
+    switches = found.switches(m) & ~found.kinks(affine)
+    main = _main(extremal, found)
     breaks, knots, edges = [0.0], [], [0]
     held, smooth, released, unpathed = [], [], [], []
     for arc, (a, b) in enumerate(zip(main[:-1], main[1:], strict=True)):
-        # A singular arc gets one polynomial: more would let its control chatter.
         singular = affine & (found.active[arc, :m] == 0)
-        count = 1 if singular.any() else max(2, int(np.ceil(_SEGMENTS_A_HORIZON * (b - a))))
-        breaks += list(a + (b - a) * np.arange(1, count + 1) / count)
+        within = marks[(marks > a + _SAME) & (marks < b - _SAME)]
+        along = united(a + (b - a) * inner[arc], within)
+        count = len(along) - 1
+        breaks += list(along[1:])
         held += [found.active[arc, :m].astype(float)] * count
         smooth += [np.where(singular, _SMOOTHING, 0.0)] * count
         # Where every control is held, the dynamics imply the states: a state bound that is met
@@ -55,11 +69,47 @@ def laid_out(extremal: Extremal, found: Arcs) -> Layout:
         if arc < len(switches) and switches[arc]:
             knots.append(len(breaks) - 1)
     breaks[-1] = 1.0
-    known: Any = map(np.array, (held, smooth, released, unpathed))
+    unbounded = _loose(found, found.kinks(affine), np.array(edges), m)
+    if loose:
+        unbounded |= ((np.array(held) == 0) & ~affine)[:, None]
+    known: Any = map(np.array, (held, smooth, released, unpathed, unbounded))
     return Layout(np.array(breaks), tuple(knots), np.array(edges), Arcwise(*known))
 
 
-def _affine(extremal: Extremal) -> Bool[np.ndarray, " m"]:
+def _loose(
+    found: Arcs, kinks: Bool[np.ndarray, " junction"], edges: Int[np.ndarray, " end"], m: int
+) -> Bool[np.ndarray, "segment two m"]:
+    """Lower and upper bounds that controls meet at a kink, in the segment beside it in which they
+    are not held."""
+    out = np.zeros((edges[-1], 2, m), bool)
+    for j in np.flatnonzero(kinks):
+        before, after = found.active[j, :m], found.active[j + 1, :m]
+        for k in np.flatnonzero(before != after):
+            segment = edges[j + 1] - (1 if after[k] else 0)
+            out[segment, 0 if before[k] + after[k] < 0 else 1, k] = True
+    return out
+
+
+def inner_breaks(
+    extremal: Extremal, found: Arcs, affine: Bool[np.ndarray, " m"]
+) -> list[np.ndarray]:
+    """Breaks of equal distance in each arc, from 0 to 1 of it."""
+    out = []
+    for active, share in zip(found.active, np.diff(_main(extremal, found)), strict=True):
+        # A singular arc gets one polynomial: more would let its control chatter.
+        singular = np.any(affine & (active[: len(affine)] == 0))
+        count = 1 if singular else max(2, int(np.ceil(_SEGMENTS_A_HORIZON * share)))
+        out.append(np.linspace(0.0, 1.0, count + 1))
+    return out
+
+
+def _main(extremal: Extremal, found: Arcs) -> Float[np.ndarray, " end"]:
+    """Ends of the arcs as fractions of the horizon."""
+    t0, tf = float(extremal.t[0]), float(extremal.t[-1])
+    return (np.concatenate([[t0], found.junctions, [tf]]) - t0) / (tf - t0)
+
+
+def affine_controls(extremal: Extremal) -> Bool[np.ndarray, " m"]:
     """Which controls H is linear in."""
     return _curvature(extremal) <= _LINEAR
 
