@@ -146,7 +146,7 @@ def bounds(rows: Checks, a: Along, tight: float) -> None:
     states, controls = problem.state_names, problem.control_names
     h, (times, x, _, _, _), size = a.at_gauss.path, a.between, (a.size.path, a.size.x)
     inside = oversteps_between(problem, nodes_lg(2 * extremal.degree)[0], (h, x), size)
-    path, state = (over.reshape(-1, over.shape[2]) for over in inside)
+    path, state = (over.reshape(times.size, over.shape[2]) for over in inside)
     both, times = (
         lambda at, over: xp.concatenate([at, over]),
         xp.concatenate([t, times.reshape(-1)]),
