@@ -3,9 +3,10 @@
 Host only: the pure functions never see it. The default everywhere is none.
 """
 
+import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
@@ -98,6 +99,56 @@ class RichProgress:
         timer.cancel()
         timer.join()  # a bar about to start has started, so that stop ends it
         bar.stop()
+
+
+class _Spoken:
+    """A line on stderr that says what long work is at, from `delay` seconds on."""
+
+    def __init__(self, label: str, delay: float):
+        self.label, self.text, self.bar = label, label, None
+        self.lock = threading.Lock()
+        self.timer = threading.Timer(delay, self.begin)
+        self.timer.daemon = True
+        self.timer.start()
+
+    def begin(self) -> None:
+        """Shows the line."""
+        from rich.console import Console
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        with self.lock:
+            self.bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self.bar.add_task(self.text)
+            self.bar.start()
+
+    def say(self, text: str) -> None:
+        """What the work is at now."""
+        with self.lock:
+            self.text = f"{self.label}: {text}"
+            if self.bar is not None:
+                self.bar.update(self.bar.task_ids[0], description=self.text)
+
+    def end(self) -> None:
+        """Takes the line away."""
+        self.timer.cancel()
+        self.timer.join()  # one about to begin has begun, so that stop ends it
+        if self.bar is not None:
+            self.bar.stop()
+
+
+@contextmanager
+def spoken(label: str, wanted: bool, delay: float = 2.0) -> Iterator[Callable[[str], None]]:
+    """Gives a function that says on stderr what the block is at. Nothing is shown before `delay`
+    seconds, unless `wanted`, and where stderr is neither a terminal nor a notebook's."""
+    if not wanted or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
+        yield lambda text: None
+        return
+    line = _Spoken(label, delay)
+    try:
+        yield line.say
+    finally:
+        line.end()
 
 
 @contextmanager

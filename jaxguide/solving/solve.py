@@ -10,6 +10,7 @@ import numpy as np
 from jaxguide.arrays import on_device
 from jaxguide.certificate import Certified, certified
 from jaxguide.host.lapack import one_thread
+from jaxguide.host.progress import spoken
 from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.method import Method, called
 from jaxguide.nominal.refinement.ladder import on_meshes
@@ -27,6 +28,7 @@ def solve(
     guess: Any = None,
     throw: bool = True,
     watch: Callable[[Any], None] | None = None,
+    progress: bool = True,
 ) -> Certified:
     """Solves `problem` for an extremal that carries its own certificate.
 
@@ -43,6 +45,8 @@ def solve(
       `jax.random.key` for a random start of a direct solve.
     - `watch`: called after each solve of a direct method's refinement with what it is and how
       good, such as `print`. Not under a trace.
+    - `progress`: from two seconds on say on stderr which mesh is being solved, where that is a
+      terminal or a notebook.
     - `throw`: raise if it fails, and warn (`jg.SolveWarning`) if the solution is not resolved to
       the method's `mesh_tolerance`. Under a trace neither; look at `.result`.
 
@@ -56,8 +60,9 @@ def solve(
     if start.traced:
         extremal = on_fixed_mesh(by, start.problem, start.guess)
     else:
-        with np.errstate(all="ignore"), one_thread():
-            by, extremal = _found(start, watch, Pseudospectral() if method is None else None)
+        otherwise, label = Pseudospectral() if method is None else None, type(problem).__name__
+        with np.errstate(all="ignore"), one_thread(), spoken(label, progress) as say:
+            by, extremal = _found(start, _both(watch, say), otherwise)
         extremal = on_device(extremal)
     extremal = opened(extremal)
     done = certified(extremal, by.accuracy)
@@ -66,6 +71,17 @@ def solve(
         if not succeeded(extremal.result):
             warnings.warn(shortfall(done), SolveWarning, stacklevel=2)
     return done
+
+
+def _both(watch: Callable[[Any], None] | None, say: Callable[[str], None]) -> Callable[[Any], None]:
+    """A mesh is told to `watch`, if there is one, and said."""
+
+    def hear(step: Any) -> None:
+        say(str(step))
+        if watch is not None:
+            watch(step)
+
+    return hear
 
 
 # The solve under a trace, pure; compiled whole, because a bare `jax.grad` would run it operation by
