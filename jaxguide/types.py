@@ -38,9 +38,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "jg.Pseudospectral."
     )
     infeasible = (
-        "The search ended where the constraints are violated least nearby, which does not show that "
-        "no trajectory exists: give a `guess` or more `starts`, relax a constraint or a bound, or "
-        "free a component of the initial state or the final time."
+        "The search ended where nothing nearby violates the constraints less, which does not show "
+        "that no trajectory exists: give a `guess` or more `starts`, relax a constraint or a "
+        "bound, or free a component of the initial state or the final time."
     )
     bounds_violated = (
         "The extremal leaves state, control or path bounds, which shooting and "
