@@ -55,7 +55,8 @@ def oversteps_between(
         (at[1], problem.state_bounds, size[1]),
     )
     path, state = (
-        xp.maximum(*(overstep(side, bounds) for side in extremes_near(points, values))) / of
+        xp.maximum(*(overstep(side, bounds) for side in extremes_near(points, values)))
+        / of[None, None]
         for values, bounds, of in kinds
     )
     return path, state

@@ -73,10 +73,11 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     cost = over(problem.running_cost, at)
     # Points that are no nodes of the quadrature have the weight zero.
     own = 2 * legendre_matrix(nodes)[0]
-    known = jnp.where(jnp.abs(own) > _ROUNDING, over(problem.running_cost, parts), 0.0) @ own
+    known = jnp.where(jnp.abs(own)[None] > _ROUNDING, over(problem.running_cost, parts), 0.0) @ own
     missed = half * jnp.abs(cost @ weights - known)
     whole = jnp.sum(half * (jnp.abs(cost) @ weights))
-    away = (t, x + span, u + size_along(extremal.u, problem.control_bounds))
+    most = size_along(extremal.u, problem.control_bounds)
+    away = (t, x + span[None, None], u + most[None, None])
     away = jnp.abs(over(problem.running_cost, away))
     least = _LEAST_COST * 2 * jnp.sum(half) * jnp.median(jnp.where(jnp.isfinite(away), away, 0.0))
     missed = missed / positive(jnp.maximum(whole, least))
@@ -85,7 +86,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     path, state = oversteps_between(problem, nodes_lg(2 * extremal.degree)[0], at, sizes)
     worst = lambda a: jnp.max(a, axis=(1, 2), initial=0.0)
     return jnp.max(
-        jnp.stack([jnp.max(gap / span, axis=1), missed, worst(state), worst(path)]), axis=0
+        jnp.stack([jnp.max(gap / span[None], axis=1), missed, worst(state), worst(path)]), axis=0
     )
 
 
