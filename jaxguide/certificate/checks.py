@@ -114,6 +114,8 @@ def jumps(rows: Checks, a: Along, tight: float) -> None:
 def stationarity(rows: Checks, a: Along, tight: float) -> None:
     """H bar stationary in the control, and convex (Legendre-Clebsch)."""
     extremal, size, problem = a.extremal, a.size, a.extremal.problem
+    if not problem.m:
+        return
     t, names, slope = (
         extremal.t,
         problem.control_names,

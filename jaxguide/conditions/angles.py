@@ -35,4 +35,4 @@ def unwrap_angles(
         turns = jnp.round(jnp.diff(u[:, j]) / turn)
         total = jnp.concatenate([jnp.zeros(1, u.dtype), jnp.cumsum(turns)])
         columns.append(jnp.where(periodic, u[:, j] - turn * total, u[:, j]))
-    return jnp.stack(columns, axis=1)
+    return jnp.stack(columns, axis=1) if columns else u

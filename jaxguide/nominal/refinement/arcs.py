@@ -60,7 +60,7 @@ def arcs(extremal: Extremal) -> Arcs:
     inverse = np.asarray(legendre_matrix(extremal.reference_nodes))
     own = np.abs(inverse[0]) > _WEIGHTLESS
     t, x, u = (np.asarray(a) for a in _by_segment(extremal))
-    flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
+    flat = lambda a: np.concatenate(a[:, own])
     t, x, u = flat(t), flat(x), flat(u)
     h = np.asarray(jax.vmap(problem.path_constraints)(t, x, u))
     labels = [

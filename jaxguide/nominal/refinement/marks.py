@@ -107,7 +107,7 @@ def _sampled(extremal: Extremal, segments: Any, tau: Float[np.ndarray, "segment 
     x, u = rows @ x, rows @ u
     a, b = breaks[segments][:, None], breaks[np.asarray(segments) + 1][:, None]
     t = a + (b - a) * (tau + 1) / 2
-    flat = [v.reshape(-1, *v.shape[2:]) for v in (t, x, u)]
+    flat = [np.concatenate(v) for v in (t, x, u)]
     parts = [
         compiled(_along, True)(extremal.problem, *(_filled(a[k : k + _AT_ONCE]) for a in flat))
         for k in range(0, len(flat[0]), _AT_ONCE)
