@@ -126,6 +126,8 @@ def cholesky(a: Any) -> Any:
     """The lower factor; NaN where `a` is not positive definite."""
     if not on_numpy(a):
         return jnp.linalg.cholesky(a)
+    if not a.size:
+        return a
     factor, info = _potrf(a, lower=1, clean=1)
     return factor if info == 0 else np.full_like(a, np.nan)
 
@@ -134,7 +136,7 @@ def cho_solve(factor: Any, b: Any) -> Any:
     """A^-1 b from the lower Cholesky factor of A."""
     if not on_numpy(factor, b):
         return jax.scipy.linalg.cho_solve((factor, True), b)
-    return _potrs(factor, b, lower=1)[0]
+    return _potrs(factor, b, lower=1)[0] if b.size else b
 
 
 def solve_triangular(

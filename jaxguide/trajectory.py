@@ -184,7 +184,7 @@ class Extremal(Trajectory):
 @jax.jit
 def _polished(extremal: Extremal, t: Array) -> Point:
     x, u, costate = extremal.point(t)
-    if extremal.parametric:
+    if extremal.parametric or not len(u):
         return Point(x, u, costate)
     t = jnp.clip(t, extremal.t[0], extremal.t[-1])
     problem, integral = extremal.problem, extremal.multipliers.integral

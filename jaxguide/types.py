@@ -40,7 +40,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "jg.Pseudospectral."
     )
     infeasible = (
-        "The search ended where the constraints are violated least nearby, which does not show "
+        "The search ended where nothing nearby violates the constraints less, which does not show "
         "that no trajectory exists: give a `guess` or more `starts`, relax a constraint or a "
         "bound, or free a component of the initial state or the final time."
     )

@@ -116,6 +116,8 @@ def jumps(rows: Checks, a: Along, tight: float) -> None:
 def stationarity(rows: Checks, a: Along, tight: float) -> None:
     """H bar stationary in the control, and convex (Legendre-Clebsch)."""
     extremal, size, problem = a.extremal, a.size, a.extremal.problem
+    if not problem.m:
+        return
     t, names = extremal.t, problem.control_names
     gap = a.at_nodes.by_u * (size.u / size.hamiltonian)[None]
     rows.add("stationarity H_u", names, gap, t, tight)

@@ -36,4 +36,4 @@ def unwrap_angles(
         turns = xp.round(xp.diff(u[:, j]) / turn)
         total = xp.concatenate([xp.zeros_like(turns, shape=1), xp.cumsum(turns)])
         columns.append(xp.where(periodic, u[:, j] - turn * total, u[:, j]))
-    return xp.stack(columns, axis=1)
+    return xp.stack(columns, axis=1) if columns else u

@@ -50,7 +50,8 @@ def oversteps_between(
     there, segment by segment; `size`: of both."""
     bounds = (problem.path_bounds, problem.state_bounds)
     path, state = (
-        xp.maximum(*(overstep(side, within) for side in extremes_near(points, values))) / of
+        xp.maximum(*(overstep(side, within) for side in extremes_near(points, values)))
+        / of[None, None]
         for values, within, of in zip(at, bounds, size, strict=True)
     )
     return path, state

@@ -30,7 +30,7 @@ def defects(
     times, x, u = _between(extremal, tau)
     if within is not None:
         u = xp.clip(u, within[0][None, None], within[1][None, None])
-    flat = lambda a: a.reshape(-1, *a.shape[2:])
+    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
     f = rates(extremal.stated, *map(flat, (times, x, u)))[0]
     return _slopes_of_states(extremal, tau) - f.reshape(x.shape)
 
@@ -67,7 +67,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     gauss, weights = (xp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * degree))
     half = xp.diff(extremal.breaks) / 2
     size = state_sizes(problem, extremal.t, extremal.x, extremal.u)
-    flat = lambda a: a.reshape(-1, *a.shape[2:])
+    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
     t, x, u = _between(extremal, gauss)
     back = lambda a: a.reshape(*t.shape, *a.shape[1:])
     f, cost, h = map(back, rates(problem, *map(flat, (t, x, u))))
@@ -83,7 +83,7 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     missed = half * xp.abs(cost @ weights - known)
     whole = xp.sum(half * (xp.abs(cost) @ weights))
     of_u = size_along(extremal.u, problem.control_bounds)
-    away = xp.abs(rates(problem, *map(flat, (t, x + size, u + of_u)))[1])
+    away = xp.abs(rates(problem, *map(flat, (t, x + size[None, None], u + of_u[None, None])))[1])
     least = _LEAST_COST * 2 * xp.sum(half) * xp.median(xp.where(xp.isfinite(away), away, 0.0))
     missed = missed / positive(xp.maximum(whole, least))
 

@@ -28,7 +28,7 @@ class Capabilities(NamedTuple):
     - `mesh`: has a mesh that `solve` may refine. Such a method has the fields of
       `jg.Pseudospectral` that a mesh consists of (`nodes`, `segments`, `fractions`, `knots`,
       `arcwise`), those that say how long to go on (`refinements`, `mesh_tolerance`, `tolerance`,
-      `starts`, `seed`, `relaxation`) and `units(problem)`: `solve` replaces them.
+      `starts`, `seed`, `relaxation`), `units(problem)` and `key(k)`: `solve` replaces them.
     - `random_start`: takes a `jax.random.key` as its guess.
     - `array_guess`: what an array given as the guess means to it, such as "the initial costates";
       empty: it takes none.

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array, xp
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import Problem, is_free
 
@@ -23,23 +22,22 @@ def control_ends(
     no bounds (`UNBOUNDED`, say); one with bounds has half the distance between them.
     """
     lo, hi = bounds_of(problem.control_bounds, problem.m, draws.dtype)
-    finite = jnp.isfinite(lo) & jnp.isfinite(hi)
+    finite = xp.isfinite(lo) & xp.isfinite(hi)
     lead = (None,) * (draws.ndim - 1)
-    return centre[lead] + jnp.where(finite, (hi - lo) / 2, width)[lead] * draws
+    return centre[lead] + xp.where(finite, (hi - lo) / 2, width)[lead] * draws
 
 
 def bounds_middle(problem: Problem, dtype: Any) -> Float[Array, " m"]:
     """The middle of each control's bounds, 0 where it has none."""
     lo, hi = bounds_of(problem.control_bounds, problem.m, dtype)
-    return jnp.where(jnp.isfinite(lo) & jnp.isfinite(hi), (lo + hi) / 2, 0.0)
+    return xp.where(xp.isfinite(lo) & xp.isfinite(hi), (lo + hi) / 2, 0.0)
 
 
-def drawn_final_time(problem: Problem, key: Array, t0: Array, tf: Array, spread: float) -> Array:
-    """A final time whose horizon is that of the guess `tf` times exp(-spread) to exp(spread),
-    evenly in the logarithm and within its bounds; `tf` itself where it is given."""
+def drawn_final_time(problem: Problem, draw: Array, t0: Array, tf: Array) -> Array:
+    """A final time whose horizon is that of the guess `tf` times exp(`draw`), within its bounds;
+    `tf` itself where it is given."""
     spec = problem.final_time
     if not is_free(spec):
         return tf
-    factor = jnp.exp(jax.random.uniform(key, (), tf.dtype, -spread, spread))
-    lo, hi = jnp.asarray(spec.lo, tf.dtype), jnp.asarray(spec.hi, tf.dtype)
-    return jnp.clip(t0 + (tf - t0) * factor, lo, hi)
+    lo, hi = xp.asarray(spec.lo, tf.dtype), xp.asarray(spec.hi, tf.dtype)
+    return xp.clip(t0 + (tf - t0) * xp.exp(draw), lo, hi)

@@ -55,10 +55,12 @@ def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: A
 
 def _check_names(problem: Problem, name: str) -> None:
     names = getattr(problem, name)
-    if isinstance(names, str) or not isinstance(names, tuple) or not names:
+    some = bool(names) or name == "control_names"
+    if isinstance(names, str) or not isinstance(names, tuple) or not some:
         raise ValueError(
-            f"{type(problem).__name__}.{name} is {names!r}; give a non-empty tuple of strings, "
-            f"such as {name} = ('x',)."
+            f"{type(problem).__name__}.{name} is {names!r}; give a "
+            f"{'' if name == 'control_names' else 'non-empty '}tuple of strings, such as "
+            f"{name} = ('x',)."
         )
     if len(set(names)) != len(names):
         raise ValueError(

@@ -17,7 +17,7 @@ from jaxguide.solving.given import default_method
 from jaxguide.solving.solve import solve
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.wrapped import restated
-from jaxguide.types import RESULTS, succeeded
+from jaxguide.types import RESULTS, usable
 
 
 class Bellman(eqx.Module):
@@ -55,7 +55,7 @@ def bellman(problem: Problem, method: Any = None, segments: int = 4, guess: Any 
     for k in range(segments):
         extremal = solve(problem, method, guess, throw=False)
         extremals.append(extremal)
-        if not succeeded(extremal.result):
+        if not usable(extremal.result):
             break
         if not times:
             times, states = [extremal.t[0]], [extremal.x[0]]

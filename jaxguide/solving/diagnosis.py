@@ -26,7 +26,9 @@ def why(extremal: Extremal) -> str:
         sentences.append(undefined)
     else:
         misses = sorted(_misses(extremal), key=lambda m: -m[0])
-        sentences += [text for size, text in misses[:2] if size > _NEGLIGIBLE]
+        misses = [text for size, text in misses[:2] if size > _NEGLIGIBLE]
+        sentences += [_wall(extremal), *misses] if misses else []
+    sentences = [sentence for sentence in sentences if sentence]
     sentences.append(f"Largest scaled residual {float(extremal.residual):.2e}.")
     return " ".join(sentences)
 
@@ -35,10 +37,8 @@ def shortfall(extremal: Certified) -> str:
     """How far a solution is from what was asked: the worst row of its certificate, and the
     remedy."""
     rows = extremal.certificate.rows()
-    # 1e-300: rows with the bound 0 are not divided by it.
-    worst = max(
-        rows, key=lambda r: np.nan_to_num(r["value"], nan=np.inf) / max(r["tolerance"], 1e-300)
-    )
+    size = lambda row: np.nan_to_num(row["value"], nan=np.inf) / row["tolerance"]
+    worst = max((row for row in rows if row["tolerance"] > 0), key=size)
     where = f" of {worst['where']}" if worst["where"] else ""
     return (
         f"{type(extremal.problem).__name__}: {RESULTS[extremal.result]} Worst in its certificate: "
@@ -134,6 +134,33 @@ def _misses(extremal: Extremal) -> list[tuple[float, str]]:
             )
         )
     return out
+
+
+def _wall(extremal: Extremal) -> str:
+    """The bound or path constraint with the largest multiplier: what the search pressed against."""
+    problem, m, size = extremal.problem, extremal.multipliers, _sizes(extremal)
+    h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
+    paths = [f"path constraint {i}" for i in range(h.shape[1])]
+    kinds: Any = (
+        (problem.state_names, m.state, extremal.x, problem.state_bounds, size.x),
+        (problem.control_names, m.control, extremal.u, problem.control_bounds, size.u),
+        (paths, m.path, h, problem.path_bounds, size.path),
+    )
+    names = [f"{name}" for names, *_ in kinds for name in names]
+    force = np.concatenate([np.abs(np.asarray(by)) * of[None] for _, by, _, _, of in kinds], axis=1)
+    force = np.nan_to_num(force, nan=0.0, posinf=np.finfo(float).max)
+    if not force.size or not force.max() > 0:
+        return ""
+    k, i = np.unravel_index(int(np.argmax(force)), force.shape)
+    sign = np.concatenate([np.asarray(by) for _, by, *_ in kinds], axis=1)[k, i]
+    value = np.concatenate([np.asarray(v) for _, _, v, *_ in kinds], axis=1)[k, i]
+    sides = [_sides(bounds, v.shape[1]) for _, _, v, bounds, _ in kinds]
+    bound = np.concatenate([hi if sign > 0 else lo for lo, hi in sides])[i]
+    side = "upper" if sign > 0 else "lower"
+    return (
+        f"The search pressed hardest against the {side} bound {bound:g} of {names[i]} at node {k} "
+        f"(t = {float(extremal.t[k]):.6g}, value {float(value):.6g}); relax it first."
+    )
 
 
 def _worst_defect(extremal: Extremal, size: Any) -> tuple[float, str]:

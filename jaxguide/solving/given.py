@@ -61,7 +61,8 @@ def _is_unconstrained(problem: Problem) -> bool:
     infinite = lambda bounds: all(np.all(np.isinf(np.asarray(b))) for b in bounds)
     own = type(problem)
     return (
-        infinite(problem.state_bounds)
+        problem.m > 0
+        and infinite(problem.state_bounds)
         and infinite(problem.control_bounds)
         and own.path_constraints is Problem.path_constraints
         and own.integrands is Problem.integrands

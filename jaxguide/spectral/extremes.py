@@ -20,7 +20,7 @@ def extremes_near(
     """
     slope = differentiation(points)
     ends = np.concatenate([[-1.0], points, [1.0]])
-    behind, ahead = np.diff(ends)[:-1, None], np.diff(ends)[1:, None]
+    behind, ahead = np.diff(ends)[None, :-1, None], np.diff(ends)[None, 1:, None]
     first = xp.einsum("qp,spk->sqk", slope, values)
     second = xp.einsum("qp,spk->sqk", slope @ slope, values)
     step = -first / xp.where(second == 0, 1.0, second)

@@ -106,7 +106,7 @@ def _controls(
     at_nodes = node_times(program, w, rule.nodes).reshape(-1)
     own = slice(rule.first, rule.first + counts.nodes)
     x_nodes = program.support(w)[:, own].reshape(-1, counts.n) * scale.x[None]
-    own_u = w.u.reshape(-1, counts.m)
+    own_u = w.u.reshape(len(at_nodes), counts.m)
     turned = unwrap_angles(
         problem, at_nodes, x_nodes[:, : problem.n], (own_u * scale.u[None])[:, : problem.m]
     )

@@ -1,15 +1,14 @@
 """The guess that a direct solve starts from: straight, random or from an extremal."""
 
+import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxguide.arrays import Array, added, on_numpy, xp
-from jaxguide.bounds import bounds_of
 from jaxguide.conditions.units import REST, natural_units
 from jaxguide.nominal.direct.stated import beginning, stated_bounds
 from jaxguide.nominal.direct.transcription import Transcription
@@ -117,27 +116,45 @@ def random_guess(
     """The straight guess, bent at random, in user units: states by two sine waves of a third of
     their natural unit, within their bounds; controls on a line between two random values; a free
     final time within a factor of two."""
-    w = straight_guess(program, fractions, knots)
-    counts, dtype, rule = program.counts, program.dtype, program.rule
-    k_x, k_u, k_t = jax.random.split(key, 3)
-    lo, hi = bounds_of(program.problem.state_bounds, counts.n, dtype)
-    of_x, of_u = _natural_units(program, w)
-    waves = jax.random.normal(k_x, (2, counts.n), dtype) * of_x[None] / _WAVE
+    w, counts = straight_guess(program, fractions, knots), program.counts
+    dtype, rule = program.dtype, program.rule
+    draws = _draws(key, counts.n, counts.m, dtype)
+    if on_numpy(w.x0):
+        draws = jax.device_get(draws)
+    bounds, (of_x, of_u) = stated_bounds(program.problem), _natural_units(program, w)
+    waves = draws.x * of_x[None] / _WAVE
     s = fractions_at(fractions, rule.support[1:])
-    bent = sum(jnp.sin((k + 1) * jnp.pi * s)[..., None] * waves[k][None, None] for k in range(2))
-    x = jnp.clip(w.x + bent, lo[None, None], hi[None, None])
-    u_lo, u_hi = bounds_of(program.problem.control_bounds, counts.m, dtype)
-    draws = jax.random.uniform(k_u, (2, counts.m), dtype, -1.0, 1.0)
+    bent = sum(xp.sin((k + 1) * np.pi * s)[..., None] * waves[k][None, None] for k in range(2))
+    x = xp.clip(w.x + bent, *(side[None, None] for side in bounds.x))
     centre = bounds_middle(program.problem, dtype)
-    ends = control_ends(program.problem, draws, centre, UNBOUNDED * of_u)
-    ends = jnp.clip(ends, u_lo[None], u_hi[None])
+    ends = control_ends(program.problem, draws.u, centre, UNBOUNDED * of_u)
+    ends = xp.clip(ends, *(side[None] for side in bounds.u))
     s = fractions_at(fractions, rule.nodes)[..., None]
     u = ends[0][None, None] * (1 - s) + ends[1][None, None] * s
     times = w.times
     if is_free(program.problem.final_time):
-        end = drawn_final_time(program.problem, k_t, times[0], times[1], _SPREAD)
+        end = drawn_final_time(program.problem, draws.t, times[0], times[1])
         times = placed(times[0], end, fractions, knots)
     return w._replace(x=x, u=u, times=times)
+
+
+class _Draws(NamedTuple):
+    """Standard normal amplitudes of the states' waves, uniform ends of the controls on [-1, 1], and
+    the logarithm of the factor by which the horizon is longer."""
+
+    x: Float[Array, "two n"]
+    u: Float[Array, "two m"]
+    t: Float[Array, ""]
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
+def _draws(key: Array, n: int, m: int, dtype: Any) -> _Draws:
+    k_x, k_u, k_t = jax.random.split(key, 3)
+    return _Draws(
+        jax.random.normal(k_x, (2, n), dtype),
+        jax.random.uniform(k_u, (2, m), dtype, -1.0, 1.0),
+        jax.random.uniform(k_t, (), dtype, -_SPREAD, _SPREAD),
+    )
 
 
 def placed(t0: Array, tf: Array, fractions: Array, knots: tuple[int, ...]) -> Float[Array, " k"]:

@@ -40,6 +40,7 @@ from jaxguide.transforms.relaxed import relaxed
 from jaxguide.transforms.wrapped import rewrapped
 from jaxguide.types import RESULTS, is_traced
 
+RETRIES = 3  # random starts after a straight one that fails. A choice: bounds the cost of failure.
 _MOST_NODES = 512  # up to which the families keep their digits: see `jaxguide/spectral/nodes.py`
 
 
@@ -70,7 +71,8 @@ class Pseudospectral(Method):
       Radau nodes that leave out s = 1, where the state vanishes unless the Problem has endpoint
       constraints of its own.
     - `starts`, `seed`: how many guesses to solve from, the first straight and the others random;
-      the solution of least objective is returned. Under a trace: one.
+      the solution of least objective is returned. Under a trace: the first that converges. Where
+      the straight one fails, up to three random ones are tried anyway.
     - `tolerance`: of the scaled first-order conditions. `max_iterations`: of the optimiser.
     - `refinements`: how often `solve` may raise the number of nodes or segments (it also moves
       breaks, and frees the junctions of a clear structure) until each segment's defect between the
@@ -194,7 +196,9 @@ class Pseudospectral(Method):
     def __call__(self, problem: Problem, guess: Any) -> Extremal:
         """The extremal on the fixed mesh. Where `solve` would refine it on the host, one short of
         `mesh_tolerance` is `RESULTS.underresolved`."""
-        extremal = finished(problem, *self.prepared(problem, guess))
+        program, start, options = self.prepared(problem, guess)
+        starts = self._starts(problem, program, start, guess)
+        extremal = finished(problem, program, starts, options)
         if not self.refinements:
             return extremal
         resolved = jnp.max(segment_errors(extremal)) <= self.mesh_tolerance
@@ -210,12 +214,9 @@ class Pseudospectral(Method):
             units = self.units(problem, guess).items()
             print("designer units: " + ", ".join(f"{k} {v:.4g}" for k, v in units))
         with without_collection(), np.errstate(all="ignore"):
-            random = is_key(guess)
-            method, stated, near = jax.device_get((self, problem, None if random else guess))
-            if random:
-                program, start, options = jax.device_get(_prepared(self, problem, guess))
-            else:
-                program, start, options = method.prepared(stated, near)
+            near = guess if is_key(guess) else jax.device_get(guess)
+            method, stated = jax.device_get((self, problem))
+            program, start, options = method.prepared(stated, near)
             limits = limits_of(program)
             solution = _minimised(program, limits, start, options, self.quick)
             return to_extremal(stated, program, limits, solution)
@@ -265,6 +266,33 @@ class Pseudospectral(Method):
             more(known.loose, whole.m),
         )
 
+    def _starts(
+        self, problem: Problem, program: Transcription, start: interior_point.Start, guess: Any
+    ) -> interior_point.Start:
+        """`start`, and without a guess `RETRIES` random ones, along a leading axis."""
+        first = jax.tree_util.tree_map(lambda a: jnp.asarray(a)[None], start)
+        if guess is not None:
+            return first
+        if self.fractions is None:
+            fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=program.dtype)
+        else:
+            fractions = jnp.asarray(self.fractions, program.dtype)
+
+        def drawn(key: Array) -> interior_point.Start:
+            # Copies, whose cached arrays belong to this trace.
+            unit = blank_scale(program.problem, len(self.knots))
+            stated = dataclasses.replace(program, scale=unit)
+            w = random_guess(stated, fractions, self.knots, key)
+            return _begun(dataclasses.replace(program), w)
+
+        keys = jax.vmap(self.key)(jnp.arange(1, RETRIES + 1))
+        others = jax.lax.stop_gradient(jax.lax.map(drawn, keys))
+        return jax.tree_util.tree_map(lambda *a: jnp.concatenate(a), first, others)
+
+    def key(self, k: Any) -> Array:
+        """The random key of the `k`th start after the straight one."""
+        return jax.random.fold_in(jax.random.key(self.seed), k)
+
     def prepared(
         self, problem: Problem, guess: Any
     ) -> tuple[Transcription, interior_point.Start, interior_point.Options]:
@@ -294,10 +322,8 @@ class Pseudospectral(Method):
             w = from_extremal(program, fractions, self.knots, problem, guess)
         scale = designer_units(program, w)
         program = dataclasses.replace(program, scale=scale)
-        w = jax.tree_util.tree_map(operator.truediv, w, program.units)
-        node, end = program.values(w)
-        w = w._replace(path=node[:, :, whole.n + 1 :], end=end[1:])
-        start = interior_point.Start(w, *blank_duals(program, w))
+        start = _begun(program, w)
+        w = start.w
         # A guess that is an extremal needs less distance from the bounds, and a lower barrier.
         mu, push, warm = 0.1, 1e-2, False
         if isinstance(guess, Extremal):
@@ -317,21 +343,16 @@ class Pseudospectral(Method):
 def finished(
     problem: Problem,
     program: Transcription,
-    start: interior_point.Start,
+    starts: interior_point.Start,
     options: interior_point.Options,
 ) -> Extremal:
-    """The extremal that the optimiser finds from `Pseudospectral.prepared`. One compiled program
-    serves every guess, break and scale."""
+    """The extremal that the optimiser finds from the first of `starts` (with a leading axis) from
+    which it converges. One compiled program serves every guess, break and scale."""
     whole = rewrapped(program.problem, problem)
-    solution = _solved((whole, program.edges), program, start, options)
+    solution = _solved((whole, program.edges), program, starts, options)
     program = _stated(program, (whole, program.edges))
     extremal = to_extremal(problem, program, limits_of(program), solution)
     return differentiable_if(extremal.result == RESULTS.successful, extremal, problem)
-
-
-@eqx.filter_jit
-def _prepared(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
-    return method.prepared(problem, guess)
 
 
 @eqx.filter_jit
@@ -371,11 +392,40 @@ def _minimised(
 def _one_at_a_time(
     program: Transcription,
     limits: Limits,
-    start: interior_point.Start,
+    starts: interior_point.Start,
     options: interior_point.Options,
 ) -> interior_point.Solution:
-    """Under `vmap` one problem after another: batched LAPACK may hang on CPU and gains nothing."""
-    return interior_point.minimise(program, limits, start, options)
+    """From one of `starts` after another until one converges; otherwise the end that violates the
+    constraints least. Under `vmap` one problem after another: batched LAPACK may hang on CPU and
+    gains nothing."""
+    count = starts.w.x0.shape[0]
+    pick = lambda k: jax.tree_util.tree_map(lambda a: a[k], starts)
+    # A copy, whose cached arrays belong to the trace of each call.
+    own = lambda: dataclasses.replace(program)
+    once = lambda k: interior_point.minimise(own(), limits, pick(k), options)
+    if count == 1:
+        return once(0)
+
+    def another(carry: tuple[Array, interior_point.Solution]) -> tuple[Array, Any]:
+        k, best = carry
+        new = once(k)
+        good = (new.status == interior_point.CONVERGED) | ~(new.violation >= best.violation)
+        choose = lambda a, b: jnp.where(good, a, b)
+        return k + 1, jax.tree_util.tree_map(choose, new, best)
+
+    blank = jax.eval_shape(once, 0)
+    blank = jax.tree_util.tree_map(lambda a: jnp.zeros(a.shape, a.dtype), blank)
+    blank = blank._replace(violation=jnp.full_like(blank.violation, jnp.inf))
+    going = lambda c: (c[0] < count) & (c[1].status != interior_point.CONVERGED)
+    return jax.lax.while_loop(going, another, (jnp.zeros((), jnp.int32), blank))[1]
+
+
+def _begun(program: Transcription, w: Any) -> interior_point.Start:
+    """A start from the guess `w` in user units, its slacks the constraints' values."""
+    w = jax.tree_util.tree_map(operator.truediv, w, program.units)
+    node, end = program.values(w)
+    w = w._replace(path=node[:, :, program.problem.n + 1 :], end=end[1:])
+    return interior_point.Start(w, *blank_duals(program, w))
 
 
 def _stated(program: Transcription, given: tuple[Problem, Array]) -> Transcription:
@@ -387,17 +437,17 @@ def _stated(program: Transcription, given: tuple[Problem, Array]) -> Transcripti
 def _solved(
     given: tuple[Problem, Array],
     program: Transcription,
-    start: interior_point.Start,
+    starts: interior_point.Start,
     options: interior_point.Options,
 ) -> interior_point.Solution:
     """The solution for `given`, a problem and the breaks of the mesh, in the units of `program`."""
     program = _stated(program, given)
-    return _one_at_a_time(program, limits_of(program), start, options)
+    return _one_at_a_time(program, limits_of(program), starts, options)
 
 
 @_solved.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
     """The implicit function theorem on the conditions that the optimiser met, never its steps."""
-    given, program, start, options = primals
-    solution = _solved(given, program, start, options)
+    given, program, starts, options = primals
+    solution = _solved(given, program, starts, options)
     return solution, sensitivity(_stated(program, given), solution, tangents[0])

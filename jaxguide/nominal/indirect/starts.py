@@ -73,7 +73,8 @@ def _flown(
     t0 = jnp.asarray(start_value(problem.initial_time), dtype)
     tf = jnp.asarray(start_value(problem.final_time), dtype)
     tf = jnp.maximum(tf, t0 + _HORIZON) if is_free(problem.final_time) else tf
-    tf = drawn_final_time(problem, k_t, t0, tf, _SPREAD)
+    draw = jax.random.uniform(k_t, (), tf.dtype, -_SPREAD, _SPREAD)
+    tf = drawn_final_time(problem, draw, t0, tf)
     times = t0 + (tf - t0) * jnp.linspace(0.0, 1.0, total + 1, dtype=dtype)
     rate = lambda t, x: problem.dynamics(t, x, _control(ends, times, t))
     return times, rk4(rate, x0, times), ends

@@ -59,8 +59,8 @@ def arcs(extremal: Extremal) -> Arcs:
     own = np.abs(to_legendre(extremal.reference_nodes)[0]) > _WEIGHTLESS
     t = extremal.by_segment(extremal.t[:, None])[..., 0]
     x, u = extremal.by_segment(extremal.x), extremal.control_by_segment()
-    flat = lambda a: a[:, own].reshape(-1, *a.shape[2:])
-    t, x, u = flat(t), flat(x), flat(u)
+    flat: Any = lambda a: np.concatenate(a[:, own])
+    t, x, u = map(flat, (t, x, u))
     h: Any = rates(extremal.stated, t, x, u)[2]
     labels = [
         _near(u, problem.control_bounds, _NEAR_CONTROL),

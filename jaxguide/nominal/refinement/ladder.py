@@ -4,9 +4,9 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
+from jaxguide.nominal.direct.pseudospectral import RETRIES
 from jaxguide.nominal.method import Method, run_on_host
 from jaxguide.nominal.refinement.meshes import MeshStep
 from jaxguide.nominal.refinement.refine import refined
@@ -25,7 +25,7 @@ def on_meshes(
     """Solved from `guess`, from the method's random starts and up the ladder of grids, and refined.
     A method without a mesh solves from `guess` alone."""
     best = _least_of_starts(method, problem, guess)
-    if guess is None and not succeeded(best.result) and _has_ladder(method):
+    if guess is None and not succeeded(best.result) and method.capabilities.mesh:
         best = _up_the_ladder(method, problem, best)
     return refined(method, problem, best, watch) if method.capabilities.mesh else best
 
@@ -34,7 +34,7 @@ def _least_of_starts(method: Any, problem: Problem, guess: Any) -> Extremal:
     """From `guess` and from random starts, the least objective that converged."""
     best = run_on_host(method, problem, guess)
     for k in range(1, method.starts if method.capabilities.mesh else 1):
-        other = run_on_host(method, problem, jax.random.fold_in(jax.random.key(method.seed), k))
+        other = run_on_host(method, problem, method.key(k))
         good, better = (succeeded(e.result) for e in (best, other))
         if better and not (good and float(best.objective) <= float(other.objective)):
             best = other
@@ -42,14 +42,26 @@ def _least_of_starts(method: Any, problem: Problem, guess: Any) -> Extremal:
 
 
 def _up_the_ladder(method: Any, problem: Problem, best: Extremal) -> Extremal:
-    """A coarse grid first (review, section 4.4), for fewer nodes ask less of a guess; if that fails
-    too, dynamics that may be missed by a delta that shrinks to nothing (review, Theorem 2). `best`
-    where that fails."""
-    coarse = dataclasses.replace(method, segments=_COARSE)
-    below = run_on_host(coarse, problem, None)
-    if succeeded(below.result):
-        found = run_on_host(method, problem, below)
-        return found if succeeded(found.result) else best
+    """A coarse grid first (review, section 4.4), for fewer nodes ask less of a guess; then random
+    starts; then dynamics that may be missed by a delta that shrinks to nothing (review, Theorem 2).
+    `best` where all fail."""
+    coarse = dataclasses.replace(method, segments=_COARSE) if _may_be_coarse(method) else None
+    if coarse is not None:
+        below = run_on_host(coarse, problem, None)
+        if succeeded(below.result):
+            found = run_on_host(method, problem, below)
+            if succeeded(found.result):
+                return found
+    for k in range(method.starts, max(method.starts, RETRIES + 1)):
+        found = run_on_host(method, problem, method.key(k))
+        if succeeded(found.result):
+            return found
+    return best if coarse is None else _loosened(method, coarse, problem, best)
+
+
+def _loosened(method: Any, coarse: Any, problem: Problem, best: Extremal) -> Extremal:
+    """The solution from one of the problem with dynamics that may be missed; `best` if there is
+    none."""
     units = method.units(problem)
     crossing = np.array([units[name] for name in problem.state_names]) / units["time"]
     guess = None
@@ -66,8 +78,7 @@ def _up_the_ladder(method: Any, problem: Problem, best: Extremal) -> Extremal:
     return found if succeeded(found.result) else best
 
 
-def _has_ladder(method: Any) -> bool:
-    """Whether it has a mesh that may be another one."""
-    if not method.capabilities.mesh:
-        return False
-    return bool(method.refinements) and method.fractions is None and method.segments > _COARSE
+def _may_be_coarse(method: Any) -> bool:
+    """Whether it has a mesh that may be a coarser one."""
+    stated = method.fractions is not None or method.knots or method.arcwise is not None
+    return not stated and method.segments > _COARSE

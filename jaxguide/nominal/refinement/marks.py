@@ -102,7 +102,7 @@ def _sampled(extremal: Extremal, segments: Any, tau: Float[np.ndarray, "segment 
     x, u = rows @ x, rows @ u
     a, b = breaks[segments][:, None], breaks[np.asarray(segments) + 1][:, None]
     t = a + (b - a) * (tau + 1) / 2
-    flat: Any = [v.reshape(-1, *v.shape[2:]) for v in (t, x, u)]
+    flat: Any = [np.concatenate(v) for v in (t, x, u)]
     f, cost, path = rates(extremal.stated, *flat)
     other = rates(extremal.stated, flat[0], flat[1], flat[2] + 1)[2] if path.shape[1] else path
     functions = np.concatenate([f, cost[:, None]], axis=1)

@@ -37,6 +37,9 @@ _MULTIPLIERS_MAX = 1e3
 # Biegler (2006), section 3.3. It also ends at a violation of a tenth of the tolerance, which leaves
 # nothing to restore: chosen, not tuned.
 _KAPPA_RESTO, _FEASIBLE = 0.9, 10
+# Share of the violation by which a step of restoration must lower it: more than rounding. Chosen,
+# not tuned.
+_NO_LESS = 1e-12
 # If a step fails at a violation below this or the tolerance, the larger, the search has stalled;
 # otherwise the problem is infeasible. Chosen, not tuned: the square root of rounding.
 _LEAST_VIOLATION = 1e-8
@@ -132,8 +135,10 @@ def _restoration_after(setup: Setup, at: Iterate, point: Moved, found: Found) ->
         largest(c) <= options.tolerance / _FEASIBLE
     )
     failed = ~found.accepted & ~kind.estimate
+    # Against a bound steps are accepted that rounding swallows.
+    still = kind.restore & ~home & (theta >= (1 - _NO_LESS) * one_norm(at.c))
     return Restoration(
-        found.accepted & kind.restore & home, failed & kind.newton, failed & kind.restore
+        found.accepted & kind.restore & home, failed & kind.newton, failed & kind.restore | still
     )
 
 
