@@ -38,6 +38,7 @@ def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: A
             f"{type(problem).__name__}.{name} could not be evaluated with a state of "
             f"{problem.n} and a control of {problem.m} components: {e}\nIndex and stack by these "
             "sizes, with jax.numpy."
+            + ("" if problem.m else f" {type(problem).__name__}.control_names is empty: name them.")
         ) from e
     shape = getattr(out, "shape", None)
     if wanted is not None and shape != wanted:
