@@ -187,3 +187,52 @@ def test_four_stages_to_orbit():
     known = problems.reference("delta-iii")
     np.testing.assert_allclose(e.objective, known.value, rtol=2e-7)
     assert bool(e.certificate.passed.all()), str(e.certificate)
+
+
+def test_phases_share_a_parameter():
+    """x' = -k x + u over two phases, least int u^2 + (k - 1)^2/2 and the end held: one k for both,
+    and not one each."""
+
+    class Decay(jg.Problem):
+        k: object = jg.Free(0.0, 5.0, 1.0)
+        state_names = ("x",)
+        control_names = ("u",)
+        initial_state = (1.0,)
+        final_time = 1.0
+
+        def dynamics(self, t, x, u):
+            return -self.k * x + u
+
+        def running_cost(self, t, x, u):
+            return u[0] ** 2
+
+        def endpoint_cost(self, x0, xf, t0, tf):
+            return (self.k - 1) ** 2 / 2
+
+    class Later(Decay):
+        initial_state = None
+        final_time = 2.0
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return xf - 0.05
+
+    class Whole(Decay):
+        final_time = 2.0
+
+        def endpoint_cost(self, x0, xf, t0, tf):
+            return (self.k - 1) ** 2
+
+        def endpoint_constraints(self, x0, xf, t0, tf):
+            return xf - 0.05
+
+    method = jg.Pseudospectral(nodes=6, segments=2, refinements=0)
+    phased = jg.Phased((Decay(), Later()), shared=("k",))
+    assert phased.parameter_paths() == (("phases", 0, "k"),)
+    e, whole = jg.solve(phased, method), jg.solve(Whole(), method)
+    np.testing.assert_allclose(e.objective, whole.objective, rtol=1e-8)
+    first, second = phased.split(e)
+    np.testing.assert_allclose(first.problem.k, whole.problem.k, rtol=1e-6)
+    np.testing.assert_allclose(second.problem.k, first.problem.k, rtol=1e-14)
+    assert bool(e.certificate.passed.all()), str(e.certificate)
+    with pytest.raises(ValueError, match="shared has 'mass'"):
+        jg.Phased((Decay(), Later()), shared=("mass",))

@@ -119,6 +119,11 @@ def refuse_beyond(method: Method, problem: Problem) -> None:
             "does not choose; give it a number, use jg.Pseudospectral, or add it as a state with "
             "zero rate and a free initial value."
         )
+    if not problem.m and not can.mesh:
+        raise ValueError(
+            f"{kind} has no control, and {name} seeks one; use jg.Pseudospectral, which chooses "
+            "initial states and static parameters without."
+        )
     if not can.integrals and (r := count(problem, "integrands")):
         raise ValueError(
             f"{kind}.integrands: {r} integral constraints, which {name} does not enforce; write "

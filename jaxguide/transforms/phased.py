@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,6 +27,8 @@ from jaxguide.problem import (
 from jaxguide.trajectory import Extremal, Multipliers
 from jaxguide.transforms.wrapped import Wrapped, own_fields, restated
 from jaxguide.types import is_traced
+
+_BOUNDARY = {field.name for field in dataclasses.fields(Problem)}
 
 Kind = TypeVar("Kind", bound=Extremal)  # with its certificate, or without
 
@@ -57,7 +60,9 @@ class Phased(Problem):
     number or `jg.Free`), and only the first one's `initial_time` counts. A later phase's
     `initial_state` may be None: the links then give it. `links(ends)`: (r,) numbers that must
     vanish, from a `PhaseEnds` for each phase; default: the state is continuous. A function, or an
-    `equinox.Module`, whose leaves (such as the size of a jump) are then differentiable.
+    `equinox.Module`, whose leaves (such as the size of a jump) are then differentiable. `shared`:
+    names of fields, such as a static parameter, that are one and the same in all phases that have
+    them: the first one's counts.
 
     Names, times, bounds and initial entries are properties that follow from the phases: edit the
     phases, by `equinox.tree_at` or with new ones.
@@ -68,9 +73,10 @@ class Phased(Problem):
 
     phases: tuple[Problem, ...]
     links: Any
+    shared: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, phases: Any, links: Any = None):
-        self.phases = phases = tuple(phases)
+    def __init__(self, phases: Any, links: Any = None, shared: tuple[str, ...] = ()):
+        self.phases, self.shared = tuple(phases), tuple(shared)
         plain = links is not None and not isinstance(links, (eqx.Module, jax.tree_util.Partial))
         self.links = jax.tree_util.Partial(links) if plain else links
         self.check_statement()
@@ -83,6 +89,11 @@ class Phased(Problem):
         phases, links = self.phases, self.links
         if len(phases) < 2:
             raise ValueError(f"Phased: {len(phases)} phases; give at least two.")
+        for name in self.shared:
+            if name in _BOUNDARY or sum(hasattr(phase, name) for phase in phases) < 2:
+                raise ValueError(
+                    f"Phased: shared has {name!r}; name a field of your own that two phases have."
+                )
         for i, phase in enumerate(phases):
             check_initial_state(phase)
             tf = phase.final_time
@@ -166,12 +177,29 @@ class Phased(Problem):
         last: Any = np.full(len(self.phases), np.inf, own[0].dtype)
         return _join([own, (zero, zero), (np.zeros_like(last), last)])
 
+    def stated_phases(self) -> tuple[Problem, ...]:
+        """The phases, each with the fields that it shares."""
+        held: dict[str, Any] = {}
+        out = []
+        for phase in self.phases:
+            for name in self.shared:
+                if name in held and hasattr(phase, name):
+                    where = operator.attrgetter(name)
+                    phase = eqx.tree_at(where, phase, held[name], is_leaf=is_free)
+                elif hasattr(phase, name):
+                    held[name] = getattr(phase, name)
+            out.append(phase)
+        return tuple(out)
+
     def parameter_paths(self) -> tuple[tuple[str | int, ...], ...]:
         paths: list[tuple[str | int, ...]] = []
+        seen: set[str] = set()
         for i, phase in enumerate(self.phases):
             names = ("initial_time", "final_time") if i == 0 else ("final_time",)
             paths += [("phases", i, k) for k in names if is_free(getattr(phase, k))]
-            paths += [("phases", i, *path) for path in phase.parameter_paths()]
+            own = [path for path in phase.parameter_paths() if path[0] not in seen]
+            paths += [("phases", i, *path) for path in own]
+            seen |= {name for name in self.shared if hasattr(phase, name)}
         return tuple(paths)
 
     def horizons(self) -> list[tuple[Any, Any]]:
@@ -190,7 +218,11 @@ class Phased(Problem):
     def _each(self, tau: Any, x: Any, u: Any) -> list[tuple]:
         """(phase, duration, t, x, u) of each phase at `tau`."""
         parts = zip(
-            self.phases, self.horizons(), self.split_state(x), self.split_control(u), strict=True
+            self.stated_phases(),
+            self.horizons(),
+            self.split_state(x),
+            self.split_control(u),
+            strict=True,
         )
         return [(p, b - a, a + tau * (b - a), x, u) for p, (a, b), x, u in parts]
 
@@ -222,12 +254,14 @@ class Phased(Problem):
 
     def endpoint_cost(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
         ends = self._ends(x0, xf)
-        return sum(p.endpoint_cost(*end) for p, end in zip(self.phases, ends, strict=True))
+        pairs = zip(self.stated_phases(), ends, strict=True)
+        return sum(p.endpoint_cost(*end) for p, end in pairs)
 
     def endpoint_constraints(self, x0: Any, xf: Any, t0: Any, tf: Any) -> Any:
         """The phases' own constraints, the links, and the durations, which may not be negative."""
         ends = self._ends(x0, xf)
-        own = [p.endpoint_constraints(*end) for p, end in zip(self.phases, ends, strict=True)]
+        pairs = zip(self.stated_phases(), ends, strict=True)
+        own = [p.endpoint_constraints(*end) for p, end in pairs]
         durations = jnp.stack([end.tf - end.t0 for end in ends])
         return jnp.concatenate([*own, self._links(ends), durations])
 
@@ -246,7 +280,8 @@ class Phased(Problem):
         own = [endpoint_count(p) for p in problem.phases]
         nu = cut(m.endpoint[: sum(own)], own)
         out = []
-        for i, (phase, (t0, tf)) in enumerate(zip(problem.phases, problem.horizons(), strict=True)):
+        stated = zip(problem.stated_phases(), problem.horizons(), strict=True)
+        for i, (phase, (t0, tf)) in enumerate(stated):
             span = tf - t0
             covectors = Multipliers(
                 nu[i], path[i] / span, per_state(m.state)[i] / span,
