@@ -92,6 +92,7 @@ ORDER: dict[str, tuple[str, ...]] = {
         "scaling",
         "guess",
         "warm",
+        "stationary",
         "pseudospectral",
     ),
     "nominal.direct.interior_point": (

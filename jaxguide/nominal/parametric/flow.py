@@ -102,7 +102,12 @@ def outcome(
     thesis, eqs (2.12)-(2.13)."""
     end = fly(problem, positions, a, start, degree)[-1, -1]
     t0, span, begin = _clock(problem, a, start)
-    ends = (jnp.asarray(initial_values(problem, a.dtype)), end[:-1], t0, begin + (1 - start.tau) * span)
+    ends = (
+        jnp.asarray(initial_values(problem, a.dtype)),
+        end[:-1],
+        t0,
+        begin + (1 - start.tau) * span,
+    )
     e = problem.endpoint_constraints(*ends)
     e = e - bounds_of(problem.endpoint_bounds, e.shape[0], e.dtype)[0]
     return problem.endpoint_cost(*ends) + end[-1], e, end[:-1]
