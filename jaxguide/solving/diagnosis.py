@@ -11,6 +11,7 @@ from jaxguide.bounds import bounds_of, overstep
 from jaxguide.certificate import Certified
 from jaxguide.nominal.defects import defects
 from jaxguide.problem import initially_free
+from jaxguide.problem.points import end_slopes, integrand_slopes, rates, slopes
 from jaxguide.trajectory import Extremal
 from jaxguide.types import RESULTS
 
@@ -19,6 +20,12 @@ _NEGLIGIBLE = 1e-8  # of a constraint's size: no miss
 
 def why(extremal: Extremal) -> str:
     """One sentence or two: the reason, the worst miss, what to try."""
+    extremal = jax.device_get(extremal)
+    with np.errstate(all="ignore"):
+        return _why(extremal)
+
+
+def _why(extremal: Extremal) -> str:
     problem = extremal.problem
     sentences = [f"{type(problem).__name__}: {RESULTS[extremal.result]}"]
     undefined = _undefined(extremal)
@@ -50,37 +57,37 @@ def shortfall(extremal: Certified) -> str:
 def _undefined(extremal: Extremal) -> str:
     """Where the problem's functions, or their derivatives, leave finite numbers."""
     problem, t, x, u = extremal.problem, extremal.t, extremal.x, extremal.u
-    t = jnp.where(jnp.isfinite(t), t, 0.0)
+    t: Any = np.where(np.isfinite(t), t, 0.0)
     for name, values in (("state", x), ("control", u)):
-        if not np.all(np.isfinite(np.asarray(values))):
+        if not np.all(np.isfinite(values)):
             return f"The last iterate's {name} left finite numbers."
-    for name in ("dynamics", "running_cost", "path_constraints", "integrands"):
-        function = getattr(problem, name)
-        value = jax.vmap(function)(t, x, u)
-        slopes = jax.vmap(jax.jacfwd(function, argnums=(1, 2)))(t, x, u)
-        for what, array in ((name, value), *((f"a derivative of {name}", s) for s in slopes)):
-            found = _first_undefined(array.reshape(len(t), -1))
+    at, (gain, gain_by) = slopes(extremal.stated, t, x, u), integrand_slopes(problem, t, x, u)
+    of_points = (
+        ("dynamics", at.f, at.f_by),
+        ("running_cost", at.cost, at.cost_by),
+        ("path_constraints", at.path, at.path_by),
+        ("integrands", gain, gain_by),
+    )
+    for name, value, by in of_points:
+        for what, array in ((name, value), (f"a derivative of {name}", by)):
+            found = _first_undefined(array.reshape(len(t), -1) if array.size else array[:, :0])
             if found:
                 k, i, bad = found
                 if what == "dynamics":
                     what = f"dynamics: d({problem.state_names[i]})/dt"
                 return (
-                    f"{what} is {bad} at node {k} (t = {float(t[k]):.6g}, x = {np.asarray(x[k])}, "
-                    f"u = {np.asarray(u[k])}); keep clear of the singularity by state bounds or a "
+                    f"{what} is {bad} at node {k} (t = {float(t[k]):.6g}, x = {x[k]}, "
+                    f"u = {u[k]}); keep clear of the singularity by state bounds or a "
                     "guess, or mend the equation."
                 )
-    ends = (x[0], x[-1], t[0], t[-1])
-    for name in ("endpoint_cost", "endpoint_constraints"):
-        function = getattr(problem, name)
-        slopes = jax.jacfwd(function, argnums=(0, 1, 2, 3))(*ends)
-        for what, array in (
-            (name, function(*ends)),
-            *((f"a derivative of {name}", s) for s in slopes),
-        ):
-            found = _first_undefined(jnp.reshape(array, (1, -1)))
+    ends = end_slopes(extremal.stated, x[0], x[-1], t[0], t[-1])
+    for name, rows in (("endpoint_cost", slice(0, 1)), ("endpoint_constraints", slice(1, None))):
+        parts = ((name, ends.value[rows]), (f"a derivative of {name}", ends.by[rows]))
+        for what, array in parts:
+            found = _first_undefined(array.reshape(1, -1) if array.size else np.zeros((1, 0)))
             if found:
                 return (
-                    f"{what} is {found[2]} at x0 = {np.asarray(x[0])}, xf = {np.asarray(x[-1])}, "
+                    f"{what} is {found[2]} at x0 = {x[0]}, xf = {x[-1]}, "
                     f"t0 = {float(t[0]):.6g}, tf = {float(t[-1]):.6g}; keep clear of the "
                     "singularity by bounds or a guess, or mend the equation."
                 )
@@ -98,7 +105,7 @@ def _misses(extremal: Extremal) -> list[tuple[float, str]]:
     """The worst of each kind of constraint: its error relative to its size, and a sentence."""
     problem, t, size = extremal.problem, np.asarray(extremal.t), _sizes(extremal)
     out = [_worst_defect(extremal, size)]
-    e = problem.endpoint_constraints(extremal.x[0], extremal.x[-1], t[0], t[-1])
+    e: Any = end_slopes(extremal.stated, extremal.x[0], extremal.x[-1], t[0], t[-1]).value[1:]
     if len(e):
         lo, hi = _sides(problem.endpoint_bounds, len(e))
         miss = np.asarray(overstep(e, problem.endpoint_bounds))
@@ -111,7 +118,7 @@ def _misses(extremal: Extremal) -> list[tuple[float, str]]:
                 "lies out of reach, relax it.",
             )
         )
-    h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
+    h: Any = rates(extremal.stated, extremal.t, extremal.x, extremal.u)[2]
     paths = [str(i) for i in range(h.shape[1])]
     kinds: Any = (
         ("State", problem.state_names, extremal.x, problem.state_bounds, size.x),
@@ -139,7 +146,7 @@ def _misses(extremal: Extremal) -> list[tuple[float, str]]:
 def _wall(extremal: Extremal) -> str:
     """The bound or path constraint with the largest multiplier: what the search pressed against."""
     problem, m, size = extremal.problem, extremal.multipliers, _sizes(extremal)
-    h = jax.vmap(problem.path_constraints)(extremal.t, extremal.x, extremal.u)
+    h: Any = rates(extremal.stated, extremal.t, extremal.x, extremal.u)[2]
     paths = [f"path constraint {i}" for i in range(h.shape[1])]
     kinds: Any = (
         (problem.state_names, m.state, extremal.x, problem.state_bounds, size.x),
@@ -166,9 +173,9 @@ def _wall(extremal: Extremal) -> str:
 def _worst_defect(extremal: Extremal, size: Any) -> tuple[float, str]:
     """Where the dynamics are missed most at the nodes, over a segment."""
     problem, times = extremal.problem, extremal.by_segment(extremal.t[:, None])[..., 0]
-    half = jnp.diff(extremal.breaks) / 2
+    half = np.diff(extremal.breaks) / 2
     gap = defects(extremal, extremal.reference_nodes) * half[:, None, None]
-    gap = np.array(jnp.abs(gap))
+    gap = np.abs(np.array(gap))
     gap[:, 0] = 0.0  # no node of Radau's grid
     gap[~np.isfinite(gap)] = 0.0
     relative = gap / size.x
@@ -190,4 +197,4 @@ def _sides(bounds: Any, size: int) -> tuple[np.ndarray, np.ndarray]:
 def _sizes(extremal: Extremal) -> Any:
     """Sizes along the last iterate as NumPy's arrays, 1 where they are not finite."""
     usable = lambda a: np.where(np.isfinite(np.asarray(a)), a, 1.0)
-    return jax.tree_util.tree_map(usable, jax.jit(Extremal.sizes)(extremal))
+    return jax.tree_util.tree_map(usable, extremal.sizes())

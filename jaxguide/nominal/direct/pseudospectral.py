@@ -224,7 +224,10 @@ class Pseudospectral(Method):
     def units(self, problem: Problem, guess: Any = None) -> dict[str, float]:
         """Designer units: what the solver takes for one of each state, control, time, constraint
         and objective, in user units, from bounds and guess. Also printed by `log`. Host only."""
-        scale = _scale(self, with_array_leaves(problem), guess)
+        with np.errstate(all="ignore"):
+            stated = jax.device_get(with_array_leaves(problem))
+            near = guess if is_key(guess) else jax.device_get(guess)
+            scale = jax.device_get(self).prepared(stated, near)[0].scale
         numbered = lambda what, k: [f"{what} {i}" for i in range(k)]
         paths = [".".join(map(str, path)) for path in problem.parameter_paths()]
         q = endpoint_count(problem)
@@ -353,11 +356,6 @@ def finished(
     program = _stated(program, (whole, program.edges))
     extremal = to_extremal(problem, program, limits_of(program), solution)
     return differentiable_if(extremal.result == RESULTS.successful, extremal, problem)
-
-
-@eqx.filter_jit
-def _scale(method: Pseudospectral, problem: Problem, guess: Any) -> Any:
-    return method.prepared(problem, guess)[0].scale
 
 
 # Seconds that programs of each size have taken on the host, and those after which one is compiled:
