@@ -10,8 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxguide.arrays import Array
 from jaxguide.bounds import bounds_of
 from jaxguide.problem import (
     Free,
