@@ -2,6 +2,7 @@
 constraints meet."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -143,8 +144,8 @@ class Identify(jg.Problem):
     """Stiffness, damping and start of an oscillator from a record interpolated linearly: nothing to
     control. J by least squares of the same integral with SciPy."""
 
-    k: object = jg.Free(0.1, 50.0)
-    c: object = jg.Free(0.0, 5.0)
+    k: Any = jg.Free(0.1, 50.0)
+    c: Any = jg.Free(0.0, 5.0)
     state_names = ("x", "v")
     initial_state = jg.Free()
     final_time = 6.0

@@ -1,6 +1,7 @@
 """Phases one after another: linked, with jumps, staged."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -194,7 +195,7 @@ def test_phases_share_a_parameter():
     and not one each."""
 
     class Decay(jg.Problem):
-        k: object = jg.Free(0.0, 5.0, 1.0)
+        k: Any = jg.Free(0.0, 5.0, 1.0)
         state_names = ("x",)
         control_names = ("u",)
         initial_state = (1.0,)
@@ -231,9 +232,10 @@ def test_phases_share_a_parameter():
     e, whole = jg.solve(phased, method), jg.solve(Whole(), method)
     np.testing.assert_allclose(e.objective, whole.objective, rtol=1e-8)
     first, second = phased.split(e)
-    k = e.problem.phases[0].k
-    np.testing.assert_allclose(k, whole.problem.k, rtol=1e-6)
-    assert second.problem.k == k and first.problem.inner.k == k
+    solved: Any = (e.problem, whole.problem, first.problem, second.problem)
+    k = solved[0].phases[0].k
+    np.testing.assert_allclose(k, solved[1].k, rtol=1e-6)
+    assert solved[2].inner.k == k and solved[3].k == k
     assert bool(e.certificate.passed.all()), str(e.certificate)
     with pytest.raises(ValueError, match="shared has 'mass'"):
         jg.Phased((Decay(), Later()), shared=("mass",))
