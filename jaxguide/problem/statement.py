@@ -43,6 +43,12 @@ class Problem(eqx.Module):
     Subclass it, name the states and controls, and write `dynamics`. Parameters are fields; a plant
     with another thrust is `dataclasses.replace(problem, thrust=...)`.
 
+    A Problem without `control_names` has no control, and `u` no entries: initial states and static
+    parameters (fields that hold a `jg.Free`) are then all there is to choose, as in identification.
+    Ends that should be alike, as on a periodic orbit, are endpoint constraints, `xf - x0`, on an
+    `initial_state` that is `jg.Free()`. `jg.Phased` joins Problems, and says which fields they
+    share.
+
     Boundary data (times, initial state, bounds, names) may be written
 
     - as plain class attributes, `final_time = 2.0`: they become fields, which `replace`,

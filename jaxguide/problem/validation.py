@@ -34,11 +34,15 @@ def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: A
     try:
         out = jax.eval_shape(getattr(with_parameters(problem, None), name), *args)
     except Exception as e:
+        kind, unnamed = type(problem).__name__, ""
+        if not problem.m:
+            unnamed = (
+                f" {kind}.control_names is (), so there is no control; if there is one, name it "
+                "there, in a tuple of strings."
+            )
         raise ValueError(
-            f"{type(problem).__name__}.{name} could not be evaluated with a state of "
-            f"{problem.n} and a control of {problem.m} components: {e}\nIndex and stack by these "
-            "sizes, with jax.numpy."
-            + ("" if problem.m else f" {type(problem).__name__}.control_names is empty: name them.")
+            f"{kind}.{name} could not be evaluated with a state of {problem.n} and a control of "
+            f"{problem.m} components: {e}\nIndex and stack by these sizes, with jax.numpy.{unnamed}"
         ) from e
     shape = getattr(out, "shape", None)
     if wanted is not None and shape != wanted:

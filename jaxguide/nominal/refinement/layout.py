@@ -5,16 +5,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxguide.bounds import bounds_of
 from jaxguide.nominal.direct.unknowns import Arcwise
 from jaxguide.nominal.refinement.arcs import Arcs
 from jaxguide.nominal.refinement.meshes import united
-from jaxguide.problem.points import control_curvature
+from jaxguide.problem.points import control_curvature, rates
 from jaxguide.trajectory import Extremal
 
 _SEGMENTS_A_HORIZON = 8  # of the mesh with free knots: a first choice, tried on ten problems
 # Weight of a singular control's roughness, in designer units: a first choice, tried on Goddard's
 # rocket, Jackson's reactor and the catalyst mixing.
 _SMOOTHING = 1e2
+# A value nearer to its bound than this share of its range is on it: the last barrier, 1e-11, holds
+# what has a multiplier nearer. What is mistaken for free shows as an overstep. Chosen, not tuned.
+_TOUCHES = 1e-7
 _SAME = 1e-9  # of the horizon: times that are one
 _LINEAR = 1e-12  # curvature of H, relative to H, below which it is linear in a control: rounding
 
@@ -88,6 +92,39 @@ def _loose(
             segment = edges[j + 1] - (1 if after[k] else 0)
             out[segment, 0 if before[k] + after[k] < 0 else 1, k] = True
     return out
+
+
+def without_idle_bounds(extremal: Extremal) -> Arcwise | None:
+    """Arcs of nothing but bounds left out: of each control and path constraint that stays away from
+    them, and of each state but at the breaks where it touches them. None where states or path
+    constraints ride on a bound between breaks, or where a control meets one: that takes a
+    structure."""
+    problem, breaks = extremal.problem, np.asarray(extremal.breaks)
+    h = np.asarray(rates(extremal.stated, extremal.t, extremal.x, extremal.u)[2])
+    kinds = (
+        (np.asarray(extremal.u), problem.control_bounds),
+        (np.asarray(extremal.x), problem.state_bounds),
+        (h, problem.path_bounds),
+    )
+    bounded = any(np.any(np.isfinite(np.asarray(b))) for _, bounds in kinds for b in bounds)
+    control, state, path = (_near_bounds(*kind) for kind in kinds)
+    on_break = np.arange(len(state)) % extremal.degree == 0
+    if not bounded or control.any() or path.any() or state[~on_break].any():
+        return None
+    segments, m, n = len(breaks) - 1, problem.m, problem.n
+    touched = state[on_break][1:]
+    released = np.stack([np.ones((segments, n), bool), ~touched], axis=1)
+    nothing = np.zeros((segments, m))
+    unpathed, loose = np.ones((segments, h.shape[1]), bool), np.ones((segments, 2, m), bool)
+    known: Any = (nothing, nothing, released, unpathed, loose)
+    return Arcwise(*known)
+
+
+def _near_bounds(values: Float[np.ndarray, "node k"], bounds: Any) -> Bool[np.ndarray, "node k"]:
+    """Where values are nearer to a bound than `_TOUCHES` of their range."""
+    lo, hi = (np.asarray(b) for b in bounds_of(bounds, values.shape[1], values.dtype))
+    span = np.maximum(np.ptp(values, axis=0), _TOUCHES * np.max(np.abs(values), axis=0))
+    return np.minimum(values - lo, hi - values) <= _TOUCHES * span
 
 
 def inner_breaks(

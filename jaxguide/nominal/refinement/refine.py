@@ -12,6 +12,7 @@ import numpy as np
 from jaxguide.nominal.defects import segment_errors
 from jaxguide.nominal.method import run_on_host
 from jaxguide.nominal.refinement.arcs import Arcs, arcs
+from jaxguide.nominal.refinement.layout import without_idle_bounds
 from jaxguide.nominal.refinement.marks import marks_of, settled
 from jaxguide.nominal.refinement.meshes import (
     MeshStep,
@@ -21,9 +22,11 @@ from jaxguide.nominal.refinement.meshes import (
     tails,
     united,
 )
-from jaxguide.nominal.refinement.structured import EXACT, RIGHT, WRONG, structured
+from jaxguide.nominal.refinement.soundness import worst_bound_errors
+from jaxguide.nominal.refinement.structured import BEYOND, EXACT, RIGHT, WRONG, structured
 from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
+from jaxguide.transforms.endless import Endless
 from jaxguide.types import RESULTS, succeeded
 
 # Largest mesh: 14 nodes keep the extrapolation to a segment's end harmless, 96 segments solve in a
@@ -259,10 +262,19 @@ def _taken(
 
 
 def _sharpened(at: _Standing, problem: Problem) -> Extremal:
-    """The best extremal, solved once more to EXACT; itself where that fails, or where chattering
-    would use the room between the nodes."""
+    """The best extremal, solved once more to EXACT, and once more without the bounds that it keeps
+    away from, whose barrier would show in costates and multipliers; itself where that fails, or
+    where chattering would use the room between the nodes."""
     tolerance = min(at.mesh.tolerance, EXACT)
-    method = dataclasses.replace(at.mesh, starts=1, tolerance=tolerance)
-    exact = run_on_host(method, problem, at.best)
+    sharp = dataclasses.replace(at.mesh, starts=1, tolerance=tolerance)
     allowed = max(_error(at.best), at.method.mesh_tolerance)
-    return exact if succeeded(exact.result) and _error(exact) <= allowed else at.best
+    good = lambda e: succeeded(e.result) and _error(e) <= allowed
+    exact = run_on_host(sharp, problem, at.best)
+    exact = exact if good(exact) else at.best
+    loosened = None if at.kept else without_idle_bounds(exact)
+    if loosened is None or isinstance(problem, Endless):
+        return exact
+    fractions = fractions_of(exact)
+    method = remeshed(sharp, fractions, sharp.nodes, (), loosened)
+    free = run_on_host(method, problem, exact)
+    return free if good(free) and max(worst_bound_errors(free)) <= BEYOND else exact

@@ -28,7 +28,7 @@ _MOST_JUNCTIONS = 24  # more are chattering, or a singular arc's noise (Fuller's
 # First choices, tried on some ten problems of the library.
 RIGHT, WRONG = 1e-5, 1e-2
 _SOUND, _CORRECTIONS = 1e-7, 4  # below _SOUND no multiplier asks for another structure
-_BEYOND = 1e-6  # by how much, of its size, a bound may be overstepped between nodes
+BEYOND = 1e-6  # by how much, of its size, a bound may be overstepped between nodes
 EXACT = 1e-11  # tolerance of the first-order conditions, so that the barrier does not show
 _NODES = 12  # of a segment of the mesh with free knots: a first choice, tried on ten problems
 # Meshes of one structure: kinks come as near as rounding in three to five, and arcs whose error is
@@ -210,4 +210,4 @@ def _solved(
 def _wrongness(exact: Extremal) -> float:
     """Its complementarity; infinite where a bound is overstepped between nodes."""
     over, complementarity = (float(v) for v in worst_bound_errors(exact))
-    return complementarity if over <= _BEYOND else np.inf
+    return complementarity if over <= BEYOND else np.inf
