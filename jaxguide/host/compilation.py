@@ -6,8 +6,9 @@ import gc
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import equinox as eqx
 import jax
+
+from jaxguide.host.executables import kept
 
 
 @functools.cache
@@ -37,6 +38,5 @@ def without_collection() -> Iterator[None]:
 
 @functools.cache
 def compiled(function: Callable[..., Any], quick: bool) -> Callable[..., Any]:
-    """`function` jitted, and kept: once with `quick_compilation`, once without."""
-    options: Any = {"compiler_options": (quick and quick_compilation()) or None}
-    return eqx.filter_jit(function, **options)
+    """`function` as by `kept`: once with `quick_compilation`, once without."""
+    return kept(function, compiler_options=(quick and quick_compilation()) or None)

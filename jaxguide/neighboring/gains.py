@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import positive, touches
+from jaxguide.host.executables import kept
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.costate_gains import gains_at
 from jaxguide.neighboring.gain_map import GainMap, HorizonGains, SweptGains
@@ -140,7 +141,7 @@ def _check_times(times: np.ndarray, t0: float, tf: float) -> None:
         )
 
 
-@eqx.filter_jit
+@kept
 def _segmented(
     extremal: Extremal,
     times: Array,
@@ -223,7 +224,7 @@ def _bound_active(
     )
 
 
-@eqx.filter_jit
+@kept
 def _collocated(exact: GainSchedule, method: str, nodes: int, tolerance: float) -> GainSchedule:
     """As `exact`, with the gains of the paper's own equations; their error is the difference."""
     extremal, times = exact.extremal, exact.times

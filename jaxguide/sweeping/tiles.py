@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
+from jaxguide.host.executables import kept
 from jaxguide.montecarlo.covariance import entry_names, linear_parts, part_names
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.miss import end_errors, miss_distance
@@ -67,11 +68,9 @@ class Tiles:
         spread_by = points_of(order)
         # Arrays are arguments of the program; all else (a disturbance given as a function, say) is
         # a part of it.
-        whole = (mission, dispersions, self._prepared, spread_by)
+        whole = (mission, dispersions, self._prepared, spread_by, seeded)
         given, rest = eqx.partition(whole, eqx.is_array)
-        leaves, self._treedef = jax.tree_util.tree_flatten(rest)
-        self._leaves = tuple(leaves)
-        self._given = [jax.device_put((given, seeded), device) for device in self.devices]
+        self._given = [eqx.combine(jax.device_put(given, device), rest) for device in self.devices]
 
     @functools.cached_property
     def _linear(self) -> tuple[np.ndarray, np.ndarray]:
@@ -177,8 +176,7 @@ class Tiles:
         return self.order.mission, jax.random.key(0), "ends"
 
     def _arguments(self, index: Any, device: int) -> tuple:
-        given, key = self._given[device]
-        return given, key, jnp.asarray(index), self._leaves, self._treedef, self.order.tile
+        return *self._given[device], jnp.asarray(index), self.order.tile
 
     def _whole(self, index: int) -> dict[str, np.ndarray]:
         # A program runs on the device that its arguments lie on.
@@ -272,9 +270,9 @@ def compiler_options() -> dict[str, Any]:
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
 
 
-_prepare = eqx.filter_jit(shared)
-_points = eqx.filter_jit(points)
-_undispersed = eqx.filter_jit(simulate)
+_prepare = kept(shared)
+_points = kept(points)
+_undispersed = kept(simulate)
 
 
 def prepared_of(order: Order) -> Prepared | None:
@@ -298,14 +296,10 @@ def _program(backend: str) -> Any:
     nothing."""
     del backend  # decides the options, so it is in the key of the cache
 
-    def tile_of(
-        given: Any, key: Array, index: Array, leaves: tuple, treedef: Any, tile: int
-    ) -> dict[str, Any]:
-        rest = jax.tree_util.tree_unflatten(treedef, leaves)
-        mission, dispersions, prepared, spread_by = eqx.combine(given, rest)
-        return _fly_tile(mission, dispersions, prepared, spread_by, key, index, tile)
+    def tile_of(*given: Any) -> dict[str, Any]:
+        return _fly_tile(*given)
 
-    return jax.jit(tile_of, static_argnums=(3, 4, 5), compiler_options=compiler_options())
+    return kept(tile_of, compiler_options=compiler_options())
 
 
 def _fly_tile(
