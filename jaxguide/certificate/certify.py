@@ -3,7 +3,7 @@
 from jaxguide.certificate import checks, costly
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Certificate, Checks
-from jaxguide.host.executables import kept
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import closed
 
@@ -22,7 +22,7 @@ def certify(extremal: Extremal, costly: bool = False, tolerance: float = 1e-9) -
     return _certified(extremal, costly, tolerance)
 
 
-@kept
+@kept_quickly
 def _certified(extremal: Extremal, fly: bool, tight: float) -> Certificate:
     rows, along = Checks(), Along(extremal if extremal.stretch is None else closed(extremal))
     if fly:

@@ -13,7 +13,7 @@ from jaxguide.flight.estimators import PlainEstimator
 from jaxguide.flight.integrators import StagedIntegrator
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.sample import Loop, Span, asked, begin, flown_across
-from jaxguide.host.executables import kept
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.laws.lanes import GridLaw, SampleGrid, StagedHold, vouches
 from jaxguide.laws.law import Law
 from jaxguide.types import RESULTS, is_traced
@@ -119,7 +119,8 @@ def _flown(mission: Mission, key: Any, saved: bool, prepared: Prepared | None) -
     return Flight(t, x, us, dus, final, times[-1], end.saturated, result)
 
 
-_program = kept(_flown)  # on the host: operation by operation it would be dozens of programs
+# On the host: operation by operation it would be dozens of programs.
+_program = kept_quickly(_flown)
 
 
 def _scan(step: Any, start: Any, items: Any) -> tuple[Any, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import positive, touches
-from jaxguide.host.executables import kept
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.costate_gains import gains_at
 from jaxguide.neighboring.gain_map import GainMap, HorizonGains, SweptGains
@@ -107,7 +107,8 @@ def gain_schedule(
     if times.ndim != 1 or times.shape[0] == 0:
         raise ValueError(f"times has shape {times.shape}; give a vector (T,) with T >= 1.")
     if not is_traced((times, extremal.t)):
-        _check_times(np.asarray(times), float(extremal.t[0]), float(extremal.t[-1]))
+        known = np.asarray(extremal.t)
+        _check_times(np.asarray(times), float(known[0]), float(known[-1]))
     sweep_nodes = NODES if nodes is None or method != "segmented" else nodes
     schedule = _segmented(extremal, times, segments, sweep_nodes, sweeps, parameters, tolerance)
     if method == "segmented":
@@ -141,7 +142,7 @@ def _check_times(times: np.ndarray, t0: float, tf: float) -> None:
         )
 
 
-@kept
+@kept_quickly
 def _segmented(
     extremal: Extremal,
     times: Array,
@@ -170,7 +171,7 @@ def _segmented(
         error=error,
         resolved=resolved,
         result=result,
-        bound_active=_bound_active(extremal, times, pair.control),
+        bound_active=_bound_active(extremal, times, pair.state, pair.control),
         K_parameters=gains.K[0, :, :, n : n + p],
         K_target=gains.K[0, :, :, n + p :],
         dtf_dx=gains.time[0, :, :n],
@@ -210,11 +211,10 @@ _ON_BOUND = 1e-6
 
 
 def _bound_active(
-    extremal: Extremal, times: Array, u: Float[Array, "time m"]
+    extremal: Extremal, times: Array, x: Float[Array, "time n"], u: Float[Array, "time m"]
 ) -> Bool[Array, " time"]:
     """Where control, state or path constraints sit on a bound: a linear law is one-sided there."""
     problem, size = extremal.problem, extremal.sizes()
-    x = jax.vmap(extremal.point)(times).x
     path = jax.vmap(problem.path_constraints)(times, x, u)
     on_any = lambda values, bounds, size: jnp.any(touches(values, bounds, _ON_BOUND * size), axis=1)
     return (
@@ -224,7 +224,7 @@ def _bound_active(
     )
 
 
-@kept
+@kept_quickly
 def _collocated(exact: GainSchedule, method: str, nodes: int, tolerance: float) -> GainSchedule:
     """As `exact`, with the gains of the paper's own equations; their error is the difference."""
     extremal, times = exact.extremal, exact.times

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.conditions.sizes import state_sizes
-from jaxguide.host.executables import kept
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.spectral import differentiation_matrix, interpolation_matrix, nodes_lg
 from jaxguide.trajectory import Extremal
 
@@ -31,7 +31,7 @@ def defects(
     return rate - jax.vmap(jax.vmap(problem.dynamics))(times, x, u)
 
 
-@kept
+@kept_quickly
 def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     """By segment, the integral of |dx/dt - f| between the nodes, relative to the state's span."""
     gauss, weights = (jnp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * extremal.degree))

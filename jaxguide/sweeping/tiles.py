@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.host.executables import kept
 from jaxguide.montecarlo.covariance import entry_names, linear_parts, part_names
 from jaxguide.montecarlo.dispersions import Distribution
@@ -270,9 +271,9 @@ def compiler_options() -> dict[str, Any]:
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
 
 
-_prepare = kept(shared)
-_points = kept(points)
-_undispersed = kept(simulate)
+_prepare = kept_quickly(shared)
+_points = kept_quickly(points)
+_undispersed = kept_quickly(simulate)
 
 
 def prepared_of(order: Order) -> Prepared | None:
@@ -299,7 +300,7 @@ def _program(backend: str) -> Any:
     def tile_of(*given: Any) -> dict[str, Any]:
         return _fly_tile(*given)
 
-    return kept(tile_of, compiler_options=compiler_options())
+    return kept(tile_of, compiler_options)
 
 
 def _fly_tile(
