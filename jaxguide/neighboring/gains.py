@@ -18,7 +18,7 @@ from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, SweepPair, s
 from jaxguide.neighboring.sufficiency import conjugate_ahead
 from jaxguide.neighboring.sweep import GROUP
 from jaxguide.problem import is_free
-from jaxguide.trajectory import Extremal
+from jaxguide.trajectory import Extremal, Point
 from jaxguide.types import RESULTS, is_traced, require_x64
 
 METHODS = ("segmented", "least_squares", "square")
@@ -55,8 +55,16 @@ class GainSchedule(eqx.Module):
 
     def __call__(self, t: Any) -> Float[Array, "m n"]:
         """K at `t`, held outside `[times[0], times[-1]]`."""
-        t = jnp.clip(jnp.asarray(t, self.times.dtype), self.times[0], self.times[-1])
-        return self.between.gain(self.extremal, self.times, t)
+        t = self.known(jnp.asarray(t, self.times.dtype))
+        return self.at(t, self.extremal(t))
+
+    def known(self, t: Array) -> Array:
+        """`t`, or the nearest time for which there are gains."""
+        return jnp.clip(t, self.times[0], self.times[-1])
+
+    def at(self, t: Array, point: Point) -> Float[Array, "m n"]:
+        """K at the scalar `t`, one of the `known` times, where `point` is `extremal(t)`."""
+        return self.between.gain(self.extremal, self.times, t, point)
 
     def history(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         """du(t) per dx(t_k), t >= t_k: the open-loop control until the next sample (2002 paper,
