@@ -74,10 +74,11 @@ class Tiles:
         self._given = [eqx.combine(jax.device_put(given, device), rest) for device in self.devices]
 
     @functools.cached_property
-    def _linear(self) -> tuple[np.ndarray, np.ndarray]:
-        """The undispersed end and the parts of its linear covariance, by `linear_parts`."""
-        ends, parts = linear_parts(self.order.mission, self.order.dispersions, self._prepared)
-        return np.asarray(ends), np.asarray(parts)
+    def _linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The undispersed end, the parts of its linear covariance and its time, by
+        `linear_parts`."""
+        order = self.order
+        return jax.device_get(linear_parts(order.mission, order.dispersions, self._prepared))
 
     @property
     def centre(self) -> np.ndarray:
@@ -115,7 +116,7 @@ class Tiles:
         size = np.where(size > 0, size, 1.0)
         if not self.order.mission.law.decides_end:
             return centre, size
-        end = float(_undispersed(*self._of_undispersed()).final_time)
+        end = float(self._linear[2])
         return np.append(centre, end), np.append(size, abs(end) * _ROUGH)
 
     @functools.cached_property
@@ -169,12 +170,7 @@ class Tiles:
         }
         if order.sampling != "random":
             texts["points"] = lowered(_points, *_of_points(order))
-        if order.mission.law.decides_end:
-            texts["end"] = lowered(_undispersed, *self._of_undispersed())
         return texts
-
-    def _of_undispersed(self) -> tuple:
-        return self.order.mission, jax.random.key(0), "ends"
 
     def _arguments(self, index: Any, device: int) -> tuple:
         return *self._given[device], jnp.asarray(index), self.order.tile
@@ -273,7 +269,6 @@ def compiler_options() -> dict[str, Any]:
 
 _prepare = kept_quickly(shared)
 _points = kept_quickly(points)
-_undispersed = kept_quickly(simulate)
 
 
 def prepared_of(order: Order) -> Prepared | None:
