@@ -146,7 +146,7 @@ def test_damaged_entry_is_made_anew(folder, compilations, damage):
     (entry,) = folder.iterdir()
     data = entry.read_bytes()
     if damage == "not a program":  # sound as a file
-        cache.put(entry.stem, b"no pickle")
+        cache.keep(entry.stem, b"no pickle")
     else:
         spoilt = {
             "short": data[:40],
@@ -214,11 +214,11 @@ def test_callbacks_are_not_kept(folder):
 
 def test_the_longest_unused_go(folder, monkeypatch):
     for i, name in enumerate("abc"):
-        cache.put(name, os.urandom(1000))
+        cache.keep(name, os.urandom(1000))
         os.utime(folder / f"{name}.program", (i, i))
     assert cache.read("a") is not None  # used now
     monkeypatch.setattr(cache, "LIMIT", 3500)
-    cache.put("d", os.urandom(1000))
+    cache.keep("d", os.urandom(1000))
     assert {p.stem for p in folder.iterdir()} == {"a", "c", "d"}
 
 

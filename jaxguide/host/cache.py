@@ -70,7 +70,7 @@ def read(key: str) -> bytes | None:
     return zlib.decompress(packed)
 
 
-def put(key: str, data: bytes) -> None:
+def keep(key: str, data: bytes) -> None:
     """Keeps `data` by `key`, if that can be done, and removes what was longest unused beyond
     `LIMIT`."""
     place = folder()

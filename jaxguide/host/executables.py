@@ -230,7 +230,7 @@ def _made(flat: Any, arrays: list[Any], static: _Static, options: dict) -> tuple
             cache.remove(key)
     compiled = lowered.compile()
     try:
-        cache.put(key, serialize_executable.serialize(compiled)[0])
+        cache.keep(key, serialize_executable.serialize(compiled)[0])
     except Exception:  # a backend may have any reason, of any type, not to serialise
         pass
     return compiled, None
