@@ -222,7 +222,8 @@ def test_the_longest_unused_go(folder, monkeypatch):
     assert {p.stem for p in folder.iterdir()} == {"a", "c", "d"}
 
 
-def test_doctor_shows_and_clears(folder, monkeypatch, capsys):
+def test_doctor_shows_and_clears(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     from jaxguide import doctor
 
     monkeypatch.setattr(doctor, "canary", lambda: 0)

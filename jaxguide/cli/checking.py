@@ -15,7 +15,7 @@ def doctor(*, clear_cache: bool = False, common: Common = Common()) -> Outcome:
     Parameters
     ----------
     clear_cache
-        First remove the compiled programs kept between processes.
+        First remove the compiled programs that the package and its command line have kept.
     """
     from jaxguide.doctor import check_installation
     from jaxguide.host import cache

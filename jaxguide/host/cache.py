@@ -8,6 +8,7 @@ of theirs: a folder or a file that others own or may write is not read.
 import contextlib
 import hashlib
 import os
+import shutil
 import stat
 import tempfile
 import zlib
@@ -41,12 +42,21 @@ def folder() -> Path | None:
     if given == "" or not hasattr(os, "geteuid"):
         return None
     try:
-        if given is not None:
-            return Path(given).expanduser()
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        return _home() / "programs" if given is None else Path(given).expanduser()
     except RuntimeError:  # a user without a home
         return None
-    return Path(home) / "jaxguide" / "programs"
+
+
+def folder_of_jax() -> Path:
+    """Where the command line lets JAX keep its own cache of every program.
+
+    **Raises:** `RuntimeError` for a user without a home.
+    """
+    return _home() / "jax"
+
+
+def _home() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxguide"
 
 
 def read(key: str) -> bytes | None:
@@ -110,15 +120,14 @@ def state() -> CacheState:
     return CacheState(place, len(sizes), sum(sizes), _trouble(place))
 
 
-def clear() -> int:
-    """Removes every entry; returns how many there were."""
+def clear() -> None:
+    """Removes every entry, and the `folder_of_jax`."""
     place = folder()
-    count = 0
     for path, _ in _files(place) if place is not None else ():
         with contextlib.suppress(OSError):
             os.unlink(path)
-            count += path.suffix == _SUFFIX
-    return count
+    with contextlib.suppress(RuntimeError):
+        shutil.rmtree(folder_of_jax(), ignore_errors=True)
 
 
 def _head(key: str) -> bytes:
