@@ -1,6 +1,7 @@
 """Checks of an installation: versions, devices, precision, cache, and a known fault of JAX.
 
-Host only, and imports nothing of jaxguide: it must run when the rest does not.
+Host only, and imports nothing of jaxguide but its cache, which is files: it must run when the rest
+does not.
 """
 
 import importlib.metadata
@@ -9,6 +10,8 @@ import platform
 from typing import Any
 
 import numpy as np
+
+from jaxguide.host import cache as programs
 
 FAULTY_JAX = ("0.10.2",)  # jax issue 39103
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "optax", "numpy")
@@ -98,6 +101,7 @@ def _environment() -> dict[str, dict[str, Any]]:
     import jax
 
     cache = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    own = programs.state()
     return {
         "devices": _check(
             [f"{d.platform}:{d.id} {d.device_kind}" for d in jax.devices()],
@@ -110,10 +114,16 @@ def _environment() -> dict[str, dict[str, Any]]:
             "nominal solves need float64: jax.config.update('jax_enable_x64', True), "
             "or set JAX_ENABLE_X64=1",
         ),
+        "programs kept": _check(
+            f"{own.folder}: {own.entries} entries, {own.size / 1e6:.1f} MB" if own.folder else None,
+            not own.trouble and (own.folder is None or _writable(str(own.folder))),
+            f"every process compiles anew: {own.trouble or 'its folder cannot be written'}; remove "
+            f"it, or set {programs.VARIABLE} to a folder of your own (mode 0700)",
+        ),
         "compilation cache": _check(
             cache,
-            cache is not None and _writable(cache),
-            "every process compiles anew: set JAX_COMPILATION_CACHE_DIR to a folder you may write",
+            cache is None or _writable(cache),
+            "JAX cannot keep programs: set JAX_COMPILATION_CACHE_DIR to a folder you may write",
         ),
         "cores": _check(os.cpu_count(), True, ""),
     }

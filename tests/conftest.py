@@ -19,6 +19,10 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_QUICK}".strip()
 jax.devices()
 os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(_QUICK, "").strip()
 
+# Programs kept between runs would hide what is compiled, and those of the option above would be
+# taken for others: nothing is kept, but by the tests of keeping.
+os.environ["JAXGUIDE_CACHE_DIR"] = ""
+
 matplotlib.use("Agg")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -1,6 +1,5 @@
 """How good an extremal is: its Certificate, computed independently of its solver."""
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -8,6 +7,7 @@ from jaxguide.arrays import on_device
 from jaxguide.certificate import checks, costly
 from jaxguide.certificate.along import Along
 from jaxguide.certificate.table import Certificate, Checks
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import closed
 from jaxguide.types import is_traced
@@ -52,7 +52,7 @@ def _certified(extremal: Extremal, rows: Checks, tight: float) -> Certificate:
     return rows.done()
 
 
-@eqx.filter_jit
+@kept_quickly
 def _finite(extremal: Extremal) -> Extremal:
     return closed(extremal)
 
@@ -62,7 +62,7 @@ def _closed(extremal: Extremal) -> Extremal:
     return extremal if extremal.stretch is None else _finite(extremal)
 
 
-@eqx.filter_jit
+@kept_quickly
 def _compiled(extremal: Extremal, fly: bool, tight: float) -> Certificate:
     rows, extremal = Checks(), _closed(extremal)
     if fly:
@@ -70,7 +70,7 @@ def _compiled(extremal: Extremal, fly: bool, tight: float) -> Certificate:
     return _certified(extremal, rows, tight)
 
 
-@eqx.filter_jit
+@kept_quickly
 def _flown(extremal: Extremal) -> Certificate:
     rows = Checks()
     costly.propagation(rows, Along(_closed(extremal)))

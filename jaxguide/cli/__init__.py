@@ -9,7 +9,6 @@ import gc
 import json
 import os
 import sys
-from pathlib import Path
 from typing import Any
 
 from cyclopts import CycloptsError
@@ -17,6 +16,7 @@ from rich.console import Console
 
 from jaxguide.cli import checking, reporting, solving, sweeping, tuning
 from jaxguide.cli.app import Common, app
+from jaxguide.host import cache
 
 COMMANDS = (
     *(solving.problems, solving.reproduce, solving.solve, solving.gains, solving.fly),
@@ -89,9 +89,9 @@ def configure() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    # JAX's own cache holds every program, those of tuning too; the package's then stands aside.
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxguide"))
+        jax.config.update("jax_compilation_cache_dir", str(cache.folder_of_jax()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 

@@ -7,13 +7,21 @@ from jaxguide.cli.app import Common, Outcome, app
 
 
 @app.command
-def doctor(*, common: Common = Common()) -> Outcome:
-    """Check versions, devices, precision, the compilation cache, and a known fault of JAX.
+def doctor(*, clear_cache: bool = False, common: Common = Common()) -> Outcome:
+    """Check versions, devices, precision, the programs kept, and a known fault of JAX.
 
     Exits with 1 if a check fails.
+
+    Parameters
+    ----------
+    clear_cache
+        First remove the compiled programs that the package and its command line have kept.
     """
     from jaxguide.doctor import check_installation
+    from jaxguide.host import cache
 
+    if clear_cache:
+        cache.clear()
     checks = check_installation()
     ok = all(check["ok"] for check in checks.values())
     table = Table("", "", "", box=None, show_header=False)

@@ -13,9 +13,10 @@ from jaxguide.flight.estimators import PlainEstimator
 from jaxguide.flight.integrators import StagedIntegrator
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.sample import Loop, Span, asked, begin, flown_across
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.laws.lanes import GridLaw, SampleGrid, StagedHold, vouches
 from jaxguide.laws.law import Law
-from jaxguide.types import RESULTS
+from jaxguide.types import RESULTS, is_traced
 
 # The time to go, as a fraction of the sample interval, below which a flight is over (the thesis
 # takes 1e-6 s, with samples of 4 s).
@@ -91,7 +92,11 @@ def simulate(
     """
     if save not in ("samples", "ends"):
         raise ValueError(f"save is {save!r}; choose 'samples' or 'ends'.")
-    saved = save == "samples"
+    arguments = mission, key, save == "samples", prepared
+    return _flown(*arguments) if is_traced(arguments) else _program(*arguments)
+
+
+def _flown(mission: Mission, key: Any, saved: bool, prepared: Prepared | None) -> Flight:
     start = begin(mission, key)
     if mission.law.decides_end:
         end, out, times = _until_arrival(mission, key, start, saved)
@@ -112,6 +117,10 @@ def simulate(
         t, x = jnp.stack([times[0], times[-1]]), jnp.stack([x0, final])
         us = dus = jnp.zeros((1, mission.plant.m), x0.dtype)
     return Flight(t, x, us, dus, final, times[-1], end.saturated, result)
+
+
+# On the host: operation by operation it would be dozens of programs.
+_program = kept_quickly(_flown)
 
 
 def _scan(step: Any, start: Any, items: Any) -> tuple[Any, Any]:

@@ -1,13 +1,13 @@
 """How entry points compile their programs. Host only."""
 
-import contextlib
 import functools
-import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
+
+from jaxguide.host.executables import Kept, kept
+from jaxguide.host.executables import without_collection as without_collection
 
 
 @functools.cache
@@ -22,21 +22,12 @@ def quick_compilation() -> dict[str, bool]:
     return options
 
 
-@contextlib.contextmanager
-def without_collection() -> Iterator[None]:
-    """Stops Python's cyclic garbage collector inside the block: it frees nothing of a program that
-    is being traced, and took a sixth of the time (by experiment on direct solves)."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()
+def kept_quickly(function: Callable[..., Any]) -> Kept:
+    """`kept` with `quick_compilation`: for programs that run but once or in milliseconds."""
+    return kept(function, quick_compilation)
 
 
 @functools.cache
 def compiled(function: Callable[..., Any], quick: bool) -> Callable[..., Any]:
-    """`function` jitted, and kept: once with `quick_compilation`, once without."""
-    options: Any = {"compiler_options": (quick and quick_compilation()) or None}
-    return eqx.filter_jit(function, **options)
+    """`function` as by `kept`: once with `quick_compilation`, once without."""
+    return kept(function, quick_compilation if quick else None)

@@ -62,14 +62,18 @@ class NeighboringOptimal(GridLaw):
     def _gain(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         """du(t) per dx(t_k). Before the schedule's first time and after its last, the gain of that
         time is used."""
-        known = jnp.clip(t_k, self.schedule.times[0], self.schedule.times[-1])
+        known = self.schedule.known(t_k)
         return self.scale * self.schedule.history(known, jnp.where(known == t_k, t, known))
 
     def prepared(self, grid: SampleGrid, histories: bool) -> "PreparedNeighboring":
         extremal = self.schedule.extremal
         as_gains = lambda a: a.astype(extremal.t.dtype)
         grid_times, stages = as_gains(grid.times), as_gains(grid.stages)
-        K = jax.vmap(self.schedule)(grid_times)
+        # The extremal at all times at once, which is compiled once.
+        known, count = self.schedule.known(grid_times), grid_times.shape[0]
+        points = extremal(jnp.concatenate([known, grid_times, stages.reshape(-1)]))
+        first = jax.tree_util.tree_map(lambda a: a[:count], points)
+        K = jax.vmap(self.schedule.at)(known, first)
         maps = None
         # One `vmap` over all stages: two, nested, take twice as long to trace.
         by_stage = lambda a: a.reshape(*stages.shape, *a.shape[1:])
@@ -77,9 +81,9 @@ class NeighboringOptimal(GridLaw):
             samples = jnp.repeat(grid_times, stages.shape[1])
             maps = by_stage(jax.vmap(self._gain)(samples, stages.reshape(-1)))
         stacked = PreparedNeighboring(
-            extremal(grid_times).x,
+            points.x[count : 2 * count],
             self.scale * K,
-            by_stage(extremal(stages.reshape(-1)).u),
+            by_stage(points.u[2 * count :]),
             maps,
             jnp.broadcast_to(jnp.asarray(self.cap, K.dtype), (grid.times.shape[0],)),
             grid_times < extremal.t[-1],

@@ -186,13 +186,8 @@ class TimeToGo(Law):
     def _reference(self, x: Array, guess: Array) -> tuple[Array, Bool[Array, ""]]:
         """The fraction of the horizon at which the time to go does not change, and whether it was
         found (`guess` if not)."""
-
-        def change(tau: Array, law: "TimeToGo", x: Array) -> Array:
-            gains = law.interpolation(law.schedule, tau)
-            return jnp.dot(gains.time.astype(x.dtype), x - law.schedule.state(tau).astype(x.dtype))
-
         frozen, at, middle = jax.lax.stop_gradient((self, x, guess))
-        value = lambda tau: change(tau, frozen, at)
+        value = lambda tau: _change(frozen, at, tau)
         both = lambda tau: jax.jvp(value, (tau,), (jnp.ones_like(tau),))
         # Its last polynomial gives the nominal a little past its end: a quarter interval (chosen).
         positions = frozen.schedule.positions
@@ -201,7 +196,8 @@ class TimeToGo(Law):
         high = jnp.minimum(middle + self.window, past).astype(x.dtype)
         # Compared with an earlier nominal state the vehicle is ahead: the change rises through zero
         # (page 28 of the thesis has the signs the other way round).
-        bracketed = (value(low) < 0) & (value(high) > 0)
+        below, above = jax.vmap(value)(jnp.stack([low, high]))
+        bracketed = (below < 0) & (above > 0)
 
         def newton(carry: tuple, _: None) -> tuple[tuple, None]:
             tau, low, high, _ = carry
@@ -218,4 +214,12 @@ class TimeToGo(Law):
         tau = jax.lax.stop_gradient(jnp.where(found, tau, middle))
         # One more step of Newton gives the derivatives of the root.
         steep = jax.lax.stop_gradient(jnp.where(found, both(tau)[1], 1.0))
-        return jnp.where(found, tau - change(tau, self, x) / steep, guess), found
+        return jnp.where(found, tau - _change(self, x, tau) / steep, guess), found
+
+
+@eqx.filter_jit
+def _change(law: TimeToGo, x: Array, tau: Array) -> Float[Array, ""]:
+    """Change of the time to go if `x` is the state at `tau`. Jitted, so that its uses are traced,
+    batched and differentiated once."""
+    gains = law.interpolation(law.schedule, tau)
+    return jnp.dot(gains.time.astype(x.dtype), x - law.schedule.state(tau).astype(x.dtype))

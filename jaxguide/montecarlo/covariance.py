@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.miss import end_errors
 from jaxguide.montecarlo.rollouts import draw, leaf_at, sorted_by_path, spread, with_deviations
@@ -29,31 +29,31 @@ def linear_covariance(
 
     **Error:** first order in the dispersions; the sampled covariance of a sweep shows the rest.
     """
-    ends, parts = linear_parts(mission, dispersions, prepared)
+    ends, parts, _ = linear_parts(mission, dispersions, prepared)
     n = mission.plant.n
     return ends[:n], jnp.sum(parts, axis=0)[:n, :n]
 
 
-@eqx.filter_jit
+@kept_quickly
 def linear_parts(
     mission: Mission, dispersions: dict[Any, Distribution], prepared: Prepared | None = None
-) -> tuple[Float[Array, " k"], Float[Array, "part k k"]]:
+) -> tuple[Float[Array, " k"], Float[Array, "part k k"], Float[Array, ""]]:
     """The end of the undispersed flight and the covariance that each part of the dispersions adds.
 
-    **Returns:** the end (k,): the final state, then its `end_errors`; and for each part, in the
-    order of `part_names`, its share (k, k) of the covariance of the end.
+    **Returns:** the end (k,): the final state, then its `end_errors`; for each part, in the order
+    of `part_names`, its share (k, k) of the covariance of the end; and the time of the end.
     """
     shapes = jax.eval_shape(lambda: draw(mission, dispersions, jax.random.key(0)))
     zeros = {path: jnp.zeros(s.shape, s.dtype) for path, s in shapes.items()}
 
-    def end(draws: dict[str, Array]) -> tuple[Array, Array]:
+    def end(draws: dict[str, Array]) -> tuple[Array, tuple[Array, Array]]:
         deviated = with_deviations(mission, draws)
         flight = simulate(deviated, jax.random.key(0), "ends", prepared)
         errors = end_errors(deviated, flight.final_state, flight.final_time)
         both = jnp.concatenate([flight.final_state, errors])
-        return both, both
+        return both, (both, flight.final_time)
 
-    jacobians, ends = jax.jacfwd(end, has_aux=True)(zeros)
+    jacobians, (ends, final_time) = jax.jacfwd(end, has_aux=True)(zeros)
     parts = [jnp.zeros((0, ends.size, ends.size), ends.dtype)]
     for (paths, distribution), (_, covariance) in zip(
         sorted_by_path(dispersions), spread(mission, dispersions), strict=True
@@ -65,7 +65,7 @@ def linear_parts(
             parts.append(columns[:, :, None] * columns[:, None, :])
         else:
             parts.append((flat @ covariance @ flat.T)[None])
-    return ends, jnp.concatenate(parts)
+    return ends, jnp.concatenate(parts), final_time
 
 
 def part_names(mission: Mission, dispersions: dict[Any, Distribution]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from jaxguide.neighboring.propagation import propagate
 from jaxguide.neighboring.segmented import canonical_at
 from jaxguide.neighboring.sweep import Sweep
 from jaxguide.spectral import interpolate
-from jaxguide.trajectory import Extremal
+from jaxguide.trajectory import Extremal, Point
 
 # Share of the span of times by which a time may differ from a sample and count as it: some 1e4
 # roundings, chosen.
@@ -25,9 +25,9 @@ class GainMap(eqx.Module):
 
     @abc.abstractmethod
     def gain(
-        self, extremal: Extremal, times: Float[Array, " time"], t: Float[Array, ""]
+        self, extremal: Extremal, times: Float[Array, " time"], t: Float[Array, ""], point: Point
     ) -> Float[Array, "m n"]:
-        """K(t): du(t) per dx(t), `t` within `[times[0], times[-1]]`."""
+        """K(t): du(t) per dx(t), `t` within `[times[0], times[-1]]`; `point`: `extremal(t)`."""
 
     @abc.abstractmethod
     def history(
@@ -46,9 +46,9 @@ class SweptGains(GainMap):
     sweep: Sweep
 
     def gain(
-        self, extremal: Extremal, times: Float[Array, " time"], t: Float[Array, ""]
+        self, extremal: Extremal, times: Float[Array, " time"], t: Float[Array, ""], point: Point
     ) -> Float[Array, "m n"]:
-        c, _ = canonical_at(extremal.problem, t, extremal(t), ())
+        c, _ = canonical_at(extremal.problem, t, point, ())
         return gains_at(self.sweep, c, t, False).K[:, : extremal.problem.n]
 
     def history(
@@ -69,7 +69,7 @@ class HorizonGains(GainMap):
     horizons: Horizons
 
     def gain(
-        self, extremal: Extremal, times: Float[Array, " time"], t: Float[Array, ""]
+        self, extremal: Extremal, times: Float[Array, " time"], t: Float[Array, ""], point: Point
     ) -> Float[Array, "m n"]:
         # du(t) = C(t) dx(t_k) and dx(t) = X(t) dx(t_k) on the horizon begun at t_k <= t.
         X, C = self._maps(extremal, times, t, t)

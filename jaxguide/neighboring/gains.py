@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import positive, touches
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.costate_gains import gains_at
 from jaxguide.neighboring.gain_map import GainMap, HorizonGains, SweptGains
@@ -17,7 +18,7 @@ from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, SweepPair, s
 from jaxguide.neighboring.sufficiency import conjugate_ahead
 from jaxguide.neighboring.sweep import GROUP
 from jaxguide.problem import is_free
-from jaxguide.trajectory import Extremal
+from jaxguide.trajectory import Extremal, Point
 from jaxguide.types import RESULTS, is_traced, require_x64
 
 METHODS = ("segmented", "least_squares", "square")
@@ -54,8 +55,16 @@ class GainSchedule(eqx.Module):
 
     def __call__(self, t: Any) -> Float[Array, "m n"]:
         """K at `t`, held outside `[times[0], times[-1]]`."""
-        t = jnp.clip(jnp.asarray(t, self.times.dtype), self.times[0], self.times[-1])
-        return self.between.gain(self.extremal, self.times, t)
+        t = self.known(jnp.asarray(t, self.times.dtype))
+        return self.at(t, self.extremal(t))
+
+    def known(self, t: Array) -> Array:
+        """`t`, or the nearest time for which there are gains."""
+        return jnp.clip(t, self.times[0], self.times[-1])
+
+    def at(self, t: Array, point: Point) -> Float[Array, "m n"]:
+        """K at the scalar `t`, one of the `known` times, where `point` is `extremal(t)`."""
+        return self.between.gain(self.extremal, self.times, t, point)
 
     def history(self, t_k: Any, t: Any) -> Float[Array, "m n"]:
         """du(t) per dx(t_k), t >= t_k: the open-loop control until the next sample (2002 paper,
@@ -106,7 +115,8 @@ def gain_schedule(
     if times.ndim != 1 or times.shape[0] == 0:
         raise ValueError(f"times has shape {times.shape}; give a vector (T,) with T >= 1.")
     if not is_traced((times, extremal.t)):
-        _check_times(np.asarray(times), float(extremal.t[0]), float(extremal.t[-1]))
+        known = np.asarray(extremal.t)
+        _check_times(np.asarray(times), float(known[0]), float(known[-1]))
     sweep_nodes = NODES if nodes is None or method != "segmented" else nodes
     schedule = _segmented(extremal, times, segments, sweep_nodes, sweeps, parameters, tolerance)
     if method == "segmented":
@@ -140,7 +150,7 @@ def _check_times(times: np.ndarray, t0: float, tf: float) -> None:
         )
 
 
-@eqx.filter_jit
+@kept_quickly
 def _segmented(
     extremal: Extremal,
     times: Array,
@@ -169,7 +179,7 @@ def _segmented(
         error=error,
         resolved=resolved,
         result=result,
-        bound_active=_bound_active(extremal, times, pair.control),
+        bound_active=_bound_active(extremal, times, pair.state, pair.control),
         K_parameters=gains.K[0, :, :, n : n + p],
         K_target=gains.K[0, :, :, n + p :],
         dtf_dx=gains.time[0, :, :n],
@@ -209,11 +219,10 @@ _ON_BOUND = 1e-6
 
 
 def _bound_active(
-    extremal: Extremal, times: Array, u: Float[Array, "time m"]
+    extremal: Extremal, times: Array, x: Float[Array, "time n"], u: Float[Array, "time m"]
 ) -> Bool[Array, " time"]:
     """Where control, state or path constraints sit on a bound: a linear law is one-sided there."""
     problem, size = extremal.problem, extremal.sizes()
-    x = jax.vmap(extremal.point)(times).x
     path = jax.vmap(problem.path_constraints)(times, x, u)
     on_any = lambda values, bounds, size: jnp.any(touches(values, bounds, _ON_BOUND * size), axis=1)
     return (
@@ -223,7 +232,7 @@ def _bound_active(
     )
 
 
-@eqx.filter_jit
+@kept_quickly
 def _collocated(exact: GainSchedule, method: str, nodes: int, tolerance: float) -> GainSchedule:
     """As `exact`, with the gains of the paper's own equations; their error is the difference."""
     extremal, times = exact.extremal, exact.times

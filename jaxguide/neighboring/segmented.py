@@ -38,7 +38,8 @@ class SweepPair(NamedTuple):
     sweep: Sweep
     finer: Sweep
     at_times: Canonical
-    control: Float[Array, "time m"]  # of the extremal, at the requested times
+    state: Float[Array, "time n"]  # of the extremal, at the requested times
+    control: Float[Array, "time m"]
     convex: Bool[Array, " segment"]  # H_uu positive definite at the segment's nodes
 
 
@@ -82,7 +83,7 @@ def solve_sweeps(
     ]
     at_times = jax.tree_util.tree_map(lambda a: a[both:], c)
     convex = jnp.all(convex[:first].reshape(counts[0], segments), axis=0)
-    return SweepPair(pair[0], pair[1], at_times, points.u[both:], convex)
+    return SweepPair(pair[0], pair[1], at_times, points.x[both:], points.u[both:], convex)
 
 
 def _gauss_times(breaks: Float[Array, " edge"], s: int) -> Float[Array, "s segment"]:

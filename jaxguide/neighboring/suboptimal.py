@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import positive, size_along
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.linalg import gauss_solve
 from jaxguide.nominal.parametric import flow as par
 from jaxguide.nominal.parametric.equality import KKTPoint, polished
@@ -200,7 +201,7 @@ def _derivatives(
     return Sensitivities(final[:, p:], final[:, :p], psi[:, p:], psi[:, :p], G[:, :p], G[:, p:])
 
 
-@eqx.filter_jit
+@kept_quickly
 def _schedule(
     extremal: Extremal, stations: Array, positions: Array, whole: bool
 ) -> tuple[SuboptimalSchedule, Float[Array, " g"]]:
@@ -332,7 +333,7 @@ def _optimum(
     return polished(values, KKTPoint(a, nu), args), active
 
 
-@eqx.filter_jit
+@kept_quickly
 def remaining_optimum(
     extremal: Extremal, stations: Float[Array, " g"], dx: Float[Array, "g n"]
 ) -> Float[Array, "g p"]:

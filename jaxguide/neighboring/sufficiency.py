@@ -23,8 +23,9 @@ def conjugate_ahead(sweep: Sweep, times: Float[Array, " time"]) -> Array:
         forward = sweep.transition(i, l)[:, : 2 * n]  # its inverse is [[d^T, -b^T], ...]
         b, d = forward[:n, n:], forward[n:, n:]
         G = sweep.ends[i][:n, : 2 * n]
-        S = -gauss_solve(G[:, n:], G[:, :n])
-        L = _root(-gauss_solve(d.T, b.T))
+        # Both systems at once: elimination is unrolled, and compiled for each call.
+        S, N = jax.vmap(gauss_solve)(jnp.stack([G[:, n:], d.T]), jnp.stack([-G[:, :n], -b.T]))
+        L = _root(N)
         return ~cholesky_positive(eye + L.T @ ((S + S.T) / 2) @ L)
 
     # Nothing is conjugate within the last segment of a resolved mesh, where S may be infinite.

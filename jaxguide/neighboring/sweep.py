@@ -87,7 +87,9 @@ def collocate(
     `sweeps` Picard sweeps from `start` (None: the identity)."""
     s, two_n, w, _ = M.shape
     _, weights, W = _gauss_integration(s)
-    W, weights = jnp.asarray(W, M.dtype), jnp.asarray(weights, M.dtype)
+    # The last row leads to the segment's start: a sweep costs little more with it, and the product
+    # is compiled once.
+    W = jnp.asarray(np.concatenate([W, weights[None]]), M.dtype)
     half = (widths / 2)[None, None, None, :]
     eye = identity((two_n, w), M.dtype)[None, :, :, None]
 
@@ -96,13 +98,17 @@ def collocate(
         return sum(products[1:], products[0])
 
     # The first sweep from Psi = I needs no product: F = M.
-    psi = eye + half * jnp.tensordot(W, M, 1) if start is None else start
+    psi = eye + half * jnp.tensordot(W[:s], M, 1) if start is None else start
 
-    def sweep(_: Any, psi: Array) -> Array:
-        return eye + half * jnp.tensordot(W, times_m(psi), 1)
+    def sweep(_: Any, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        psi = carry[0]
+        out = eye + half * jnp.tensordot(W, times_m(psi), 1)
+        return out[:s], psi, out[s]
 
-    psi = jax.lax.fori_loop(0, sweeps - (start is None), sweep, psi)
-    return psi, eye[0] + half[0] * jnp.tensordot(weights, times_m(psi), 1)
+    # One sweep more, for the start that belongs to the last Psi.
+    carry = (psi, psi, psi[0])
+    _, psi, begin = jax.lax.fori_loop(0, sweeps + (start is not None), sweep, carry)
+    return psi, begin
 
 
 def orthonormal_rows(G: Float[Array, "row w"], n: int, two_n: int) -> Float[Array, "row w"]:

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from jaxtyping import Array, Int
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, Prepared, simulate
+from jaxguide.host.executables import kept
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.sampling import Points
 from jaxguide.sweeping.tiles import Order, dispersed_case, lowered, points_of, prepared_of
@@ -68,7 +68,7 @@ def _arguments(
     return mission, dispersions, prepared_of(order), points_of(order), seeded
 
 
-@eqx.filter_jit
+@kept
 def _fly_in_full(
     mission: Mission,
     dispersions: dict[Any, Distribution],

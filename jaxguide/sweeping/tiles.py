@@ -15,6 +15,8 @@ from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
+from jaxguide.host.compilation import kept_quickly
+from jaxguide.host.executables import kept
 from jaxguide.montecarlo.covariance import entry_names, linear_parts, part_names
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.miss import end_errors, miss_distance
@@ -67,17 +69,16 @@ class Tiles:
         spread_by = points_of(order)
         # Arrays are arguments of the program; all else (a disturbance given as a function, say) is
         # a part of it.
-        whole = (mission, dispersions, self._prepared, spread_by)
+        whole = (mission, dispersions, self._prepared, spread_by, seeded)
         given, rest = eqx.partition(whole, eqx.is_array)
-        leaves, self._treedef = jax.tree_util.tree_flatten(rest)
-        self._leaves = tuple(leaves)
-        self._given = [jax.device_put((given, seeded), device) for device in self.devices]
+        self._given = [eqx.combine(jax.device_put(given, device), rest) for device in self.devices]
 
     @functools.cached_property
-    def _linear(self) -> tuple[np.ndarray, np.ndarray]:
-        """The undispersed end and the parts of its linear covariance, by `linear_parts`."""
-        ends, parts = linear_parts(self.order.mission, self.order.dispersions, self._prepared)
-        return np.asarray(ends), np.asarray(parts)
+    def _linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The undispersed end, the parts of its linear covariance and its time, by
+        `linear_parts`."""
+        order = self.order
+        return jax.device_get(linear_parts(order.mission, order.dispersions, self._prepared))
 
     @property
     def centre(self) -> np.ndarray:
@@ -115,7 +116,7 @@ class Tiles:
         size = np.where(size > 0, size, 1.0)
         if not self.order.mission.law.decides_end:
             return centre, size
-        end = float(_undispersed(*self._of_undispersed()).final_time)
+        end = float(self._linear[2])
         return np.append(centre, end), np.append(size, abs(end) * _ROUGH)
 
     @functools.cached_property
@@ -169,16 +170,10 @@ class Tiles:
         }
         if order.sampling != "random":
             texts["points"] = lowered(_points, *_of_points(order))
-        if order.mission.law.decides_end:
-            texts["end"] = lowered(_undispersed, *self._of_undispersed())
         return texts
 
-    def _of_undispersed(self) -> tuple:
-        return self.order.mission, jax.random.key(0), "ends"
-
     def _arguments(self, index: Any, device: int) -> tuple:
-        given, key = self._given[device]
-        return given, key, jnp.asarray(index), self._leaves, self._treedef, self.order.tile
+        return *self._given[device], jnp.asarray(index), self.order.tile
 
     def _whole(self, index: int) -> dict[str, np.ndarray]:
         # A program runs on the device that its arguments lie on.
@@ -272,9 +267,8 @@ def compiler_options() -> dict[str, Any]:
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
 
 
-_prepare = eqx.filter_jit(shared)
-_points = eqx.filter_jit(points)
-_undispersed = eqx.filter_jit(simulate)
+_prepare = kept_quickly(shared)
+_points = kept_quickly(points)
 
 
 def prepared_of(order: Order) -> Prepared | None:
@@ -298,14 +292,10 @@ def _program(backend: str) -> Any:
     nothing."""
     del backend  # decides the options, so it is in the key of the cache
 
-    def tile_of(
-        given: Any, key: Array, index: Array, leaves: tuple, treedef: Any, tile: int
-    ) -> dict[str, Any]:
-        rest = jax.tree_util.tree_unflatten(treedef, leaves)
-        mission, dispersions, prepared, spread_by = eqx.combine(given, rest)
-        return _fly_tile(mission, dispersions, prepared, spread_by, key, index, tile)
+    def tile_of(*given: Any) -> dict[str, Any]:
+        return _fly_tile(*given)
 
-    return jax.jit(tile_of, static_argnums=(3, 4, 5), compiler_options=compiler_options())
+    return kept(tile_of, compiler_options)
 
 
 def _fly_tile(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, Prepared, simulate
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.laws.holds import History
 from jaxguide.laws.lanes import SampleGrid
 from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
@@ -41,7 +42,7 @@ def stage_times(times: np.ndarray) -> Float[np.ndarray, "sample stage"]:
     return times[:, None] + SAMPLE_INTERVAL * np.asarray(INTEGRATOR.stages)[None, :]
 
 
-@eqx.filter_jit
+@kept_quickly
 def histories(
     schedule: GainSchedule, instants: Float[Array | np.ndarray, "sample stage"]
 ) -> Float[Array, "sample stage m n"]:
@@ -95,7 +96,7 @@ def fly_variants(
     return {name: pick(k) for k, name in enumerate(variants)}
 
 
-@eqx.filter_jit
+@kept_quickly
 def _fly(mission: Mission, prepared: Prepared, deviations: Array) -> Flight:
     """Every variant with every deviation, in one `vmap`: two, nested, trace twice as much."""
 
