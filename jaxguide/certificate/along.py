@@ -31,10 +31,8 @@ def hamiltonian_along(
     """H bar = H + `held`^T (path constraints, states, controls, integrands) and what it consists
     of, at points of any leading axes. Review, H bar."""
     lead, n, m = t.shape, problem.n, problem.m
-    t, (x, u, costate, held) = (
-        t.reshape(-1),
-        (a.reshape(-1, a.shape[-1]) for a in (x, u, costate, held)),
-    )
+    x, u, costate, held = (a.reshape(t.size, a.shape[-1]) for a in (x, u, costate, held))
+    t = t.reshape(-1)
     at, (gain, gain_by) = slopes(problem, t, x, u), integrand_slopes(problem, t, x, u)
     p = at.path.shape[1]
     of_path, of_own, of_gain = held[:, :p], held[:, p : p + n + m], held[:, p + n + m :]
