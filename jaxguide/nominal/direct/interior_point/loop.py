@@ -18,6 +18,7 @@ from jaxguide.nominal.direct.interior_point.state import (
     INFEASIBLE,
     NEWTON,
     RUNNING,
+    STALLED,
     Options,
     Setup,
     Solution,
@@ -89,10 +90,13 @@ def _advanced(setup: Setup, s: State) -> State:
     at = evaluated(setup, s)
     now = at.error_now
     done = at.kind.newton & (now <= setup.options.tolerance)  # Waechter & Biegler (2006), eq. (6)
-    converged = s._replace(status=s.status * 0 + CONVERGED, iteration=s.iteration + 1, error=now)
+    # A derivative that is no number leaves no step: the error says so.
+    lost = xp.isnan(now)
+    status = s.status * 0 + xp.where(lost, STALLED, CONVERGED).astype(s.status.dtype)
+    ended = s._replace(status=status, iteration=s.iteration + 1, error=now)
     none = xp.zeros_like(s.mu)
-    stop, go_on = lambda: (converged, none, none), lambda: _step(setup, at)
-    new, delta, alpha = either(done, stop, go_on)
+    stop, go_on = lambda: (ended, none, none), lambda: _step(setup, at)
+    new, delta, alpha = either(done | lost, stop, go_on)
     program = setup.program
     if program.log:
         numbers = (s.iteration, at.f, largest(at.c), now, new.mu, delta, alpha)
