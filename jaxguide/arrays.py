@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 if TYPE_CHECKING:
     Array = jax.Array  # a type checker need not tell the engines apart
@@ -52,7 +51,13 @@ class _Engine:
 
 xp: Any = _Engine()
 
-_potrf, _potrs, _trtrs, _getrf = get_lapack_funcs(("potrf", "potrs", "trtrs", "getrf"))
+
+@functools.cache
+def _lapack(name: str) -> Any:
+    """A routine of LAPACK in float64. SciPy takes a quarter of a second to import."""
+    from scipy.linalg import get_lapack_funcs
+
+    return get_lapack_funcs(name)
 
 
 def on_device(tree: Any) -> Any:
@@ -128,7 +133,7 @@ def cholesky(a: Any) -> Any:
         return jnp.linalg.cholesky(a)
     if not a.size:
         return a
-    factor, info = _potrf(a, lower=1, clean=1)
+    factor, info = _lapack("potrf")(a, lower=1, clean=1)
     return factor if info == 0 else np.full_like(a, np.nan)
 
 
@@ -136,7 +141,7 @@ def cho_solve(factor: Any, b: Any) -> Any:
     """A^-1 b from the lower Cholesky factor of A."""
     if not on_numpy(factor, b):
         return jax.scipy.linalg.cho_solve((factor, True), b)
-    return _potrs(factor, b, lower=1)[0] if b.size else b
+    return _lapack("potrs")(factor, b, lower=1)[0] if b.size else b
 
 
 def solve_triangular(
@@ -153,7 +158,7 @@ def solve_triangular(
     if not b.size:
         return b
     # LAPACK's matrices stand by columns, so that it takes the transpose without a copy.
-    x, info = _trtrs(a.T, b, not lower, not trans, unit_diagonal)
+    x, info = _lapack("trtrs")(a.T, b, not lower, not trans, unit_diagonal)
     return x if info == 0 else np.full_like(x, np.nan)
 
 
@@ -162,7 +167,7 @@ def pivoted_lu(a: Any) -> tuple[Any, Any]:
     if a.ndim > 2:
         lu, order = zip(*map(pivoted_lu, a), strict=True)
         return np.stack(lu), np.stack(order)
-    lu, exchanges, _ = _getrf(a)
+    lu, exchanges, _ = _lapack("getrf")(a)
     order = np.arange(len(a), dtype=np.int32)
     for k, other in enumerate(exchanges):
         order[k], order[other] = order[other], order[k]
