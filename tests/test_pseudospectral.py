@@ -1,6 +1,8 @@
 """Direct solutions: the Newton step against dense algebra, closed forms, covectors, failures."""
 
 import dataclasses
+import subprocess
+import sys
 from typing import Any
 
 import jax
@@ -495,3 +497,28 @@ def test_warm_start_with_multipliers(capfd):
     assert first[0].startswith("designer units: ") and "time 1, " in first[0], first[0]
     assert first[1].split() == ["iter", "objective", "violation", "error", "mu", "delta", "step"]
     assert len(second) < len(first) / 2
+
+
+FIRST_ANSWER = """
+import sys, jax
+jax.config.update("jax_enable_x64", True)
+import jaxguide as jg
+from jaxguide import problems
+programs = []
+count = lambda event, *_, **__: "backend_compile" in event and programs.append(event)
+jax.monitoring.register_event_duration_secs_listener(count)
+solved = jg.solve(problems.get(sys.argv[1]), jg.Pseudospectral())
+assert bool(solved.certificate.passed.all()), solved.certificate
+print(len(programs))
+"""
+
+
+@pytest.mark.parametrize(
+    "name", ["two-thrusters", "hanging-chain", slow("earth-mars"), slow("delta-iii")]
+)
+def test_a_first_answer_compiles_few_programs(name):
+    """All meshes and the certificate together compile no more than twelve programs. In a process of
+    its own: this one has compiled some already."""
+    command = [sys.executable, "-c", FIRST_ANSWER, name]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert int(done.stdout) <= 12

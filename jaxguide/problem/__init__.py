@@ -19,5 +19,6 @@ from jaxguide.problem.statement import Problem as Problem
 from jaxguide.problem.statement import is_free as is_free
 from jaxguide.problem.statement import start_value as start_value
 from jaxguide.problem.statement import with_array_leaves as with_array_leaves
+from jaxguide.problem.statement import with_typed_leaves as with_typed_leaves
 from jaxguide.problem.validation import check_initial_state as check_initial_state
 from jaxguide.problem.validation import validate as validate

@@ -186,6 +186,14 @@ def with_array_leaves(problem: Problem) -> Problem:
     return jax.tree_util.tree_map(jnp.asarray, problem)
 
 
+def with_typed_leaves(problem: Problem) -> Problem:
+    """`with_array_leaves` whose floating numbers are of the default type, which compiles nothing;
+    those that are traced stay so."""
+    dtype = jnp.result_type(float)
+    typed = lambda a: np.asarray(a, dtype) if isinstance(a, float) else jnp.asarray(a)
+    return jax.tree_util.tree_map(typed, problem)
+
+
 def start_value(entry: Any) -> Any:
     """`entry` if it is a number. Of a `Free` one the point from which a search starts: its guess,
     otherwise the middle of finite limits, otherwise the admissible number closest to 0."""

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from jaxguide.problem.boundary import initial_entries, initial_values, initially_free, start_control
 from jaxguide.problem.parameters import with_parameters
-from jaxguide.problem.statement import Problem, is_free, start_value, with_array_leaves
+from jaxguide.problem.statement import Problem, is_free, start_value
 from jaxguide.types import is_traced
 
 # How far an initial state may lie outside the state bounds, relative to 1 + |x0|: the rounding of
@@ -155,7 +155,7 @@ def validate(problem: Problem) -> None:
     for name, size in sizes.items():
         _check_bounds(problem, name, size)
     with jax.ensure_compile_time_eval():  # within a trace of something else, perhaps
-        t0, tf, x0, u0, rate = jax.device_get(_start(with_array_leaves(problem)))
+        t0, tf, x0, u0, rate = jax.device_get(_start(problem))
     _check_initial_values(problem, x0)
     _check_horizon(problem, float(t0), float(tf))
     if not np.all(np.isfinite(rate)) and not any(initially_free(problem)):

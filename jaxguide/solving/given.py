@@ -9,7 +9,7 @@ from jaxguide.nominal.direct.pseudospectral import Pseudospectral
 from jaxguide.nominal.guesses import check_guess, is_key
 from jaxguide.nominal.indirect.shooting import Shooting
 from jaxguide.nominal.method import Method, refuse_beyond
-from jaxguide.problem import Problem, is_endless, validate, with_array_leaves
+from jaxguide.problem import Problem, is_endless, validate, with_typed_leaves
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import made_finite
 from jaxguide.types import is_traced
@@ -39,7 +39,7 @@ def given(problem: Problem, method: Any, guess: Any) -> Given:
     check_guess(problem, guess, method)
     traced = is_traced((problem, guess, method))
     guess = uncertified(guess) if isinstance(guess, Extremal) else guess
-    stated = with_array_leaves(problem)
+    stated = with_typed_leaves(problem)
     if is_endless(problem):
         able: Any = method  # its capabilities say that it has a time scale
         stated, guess = made_finite(stated, guess, able.time_scale)

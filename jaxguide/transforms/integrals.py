@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxguide.bounds import joined_bounds
 from jaxguide.problem import Problem, count, endpoint_count, initial_entries
@@ -45,7 +46,7 @@ def with_integrals(problem: Problem) -> Problem:
         return problem
     own = own_fields(problem)
     own["state_names"] += tuple(f"integral {i}" for i in range(r))
-    own["initial_state"] = (*initial_entries(problem), *(jnp.zeros(()),) * r)
+    own["initial_state"] = (*initial_entries(problem), *(np.zeros(()),) * r)
     any_number, q = (-math.inf, math.inf), endpoint_count(problem)
     own["state_bounds"] = joined_bounds(own["state_bounds"], problem.n, any_number, r)
     own["endpoint_bounds"] = joined_bounds(own["endpoint_bounds"], q, problem.integral_bounds, r)

@@ -31,7 +31,7 @@ from jaxguide.nominal.direct.warm import blank_duals, duals, fits
 from jaxguide.nominal.guesses import is_key
 from jaxguide.nominal.method import Capabilities, Method
 from jaxguide.nominal.roots import differentiable_if
-from jaxguide.problem import Problem, count, endpoint_count, with_array_leaves
+from jaxguide.problem import Problem, count, endpoint_count, with_typed_leaves
 from jaxguide.spectral import NodeFamily, node_family
 from jaxguide.trajectory import Extremal
 from jaxguide.transforms.endless import Endless
@@ -225,7 +225,7 @@ class Pseudospectral(Method):
         """Designer units: what the solver takes for one of each state, control, time, constraint
         and objective, in user units, from bounds and guess. Also printed by `log`. Host only."""
         with np.errstate(all="ignore"):
-            stated = jax.device_get(with_array_leaves(problem))
+            stated = jax.device_get(with_typed_leaves(problem))
             near = guess if is_key(guess) else jax.device_get(guess)
             scale = jax.device_get(self).prepared(stated, near)[0].scale
         numbered = lambda what, k: [f"{what} {i}" for i in range(k)]
@@ -305,7 +305,9 @@ class Pseudospectral(Method):
         # Where the search starts does not matter to the solution; where the breaks are, does.
         still = lambda a: a if on_numpy(a) else jax.lax.stop_gradient(a)
         problem = jax.tree_util.tree_map(still, problem)
-        whole = self.whole(problem)
+        on_host = on_numpy(*jax.tree_util.tree_leaves(problem))
+        # One array of JAX's would bring the whole algebra to it, operation by operation.
+        whole = jax.device_get(self.whole(problem)) if on_host else self.whole(problem)
         if self.fractions is None:
             fractions = xp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
         else:
