@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
 from jaxguide import problems
-from jaxguide.nominal.direct import newton_system
+from jaxguide.nominal.direct import newton_system, pseudospectral
 from jaxguide.nominal.direct.collocation import collocation, left_null
 from jaxguide.nominal.direct.elimination import eliminate
 from jaxguide.nominal.direct.guess import edges
@@ -497,6 +498,20 @@ def test_warm_start_with_multipliers(capfd):
     assert first[0].startswith("designer units: ") and "time 1, " in first[0], first[0]
     assert first[1].split() == ["iter", "objective", "violation", "error", "mu", "delta", "step"]
     assert len(second) < len(first) / 2
+
+
+@pytest.mark.slow
+def test_iterations_begun_on_the_host_are_compiled_when_that_is_worth_it(monkeypatch):
+    problem, method = LeastTime(), dataclasses.replace(ONE_MESH, segments=2, knots=(1,))
+    whole, clock = jg.solve(problem, method), iter(range(1000))
+    # A clock by which each reading takes a second: five iterations are worth a compilation.
+    monkeypatch.setattr(
+        pseudospectral, "time", SimpleNamespace(perf_counter=lambda: float(next(clock)))
+    )
+    monkeypatch.setattr(pseudospectral, "_on_host_so_far", {})
+    cut = jg.solve(problem, method)
+    for name in ("x", "u", "costate", "objective"):
+        np.testing.assert_allclose(getattr(cut, name), getattr(whole, name), rtol=0, atol=1e-11)
 
 
 FIRST_ANSWER = """

@@ -364,7 +364,7 @@ def finished(
 # about what compiling takes, so that whoever solves once or a thousand times waits at most twice as
 # long as was needed.
 _on_host_so_far: dict[Any, float] = {}
-_WORTH_COMPILING = 8.0
+_WORTH_COMPILING = 5.0
 
 
 def _minimised(
@@ -374,18 +374,20 @@ def _minimised(
     options: interior_point.Options,
     quick: bool,
 ) -> interior_point.Solution:
-    """`interior_point.minimise` by NumPy, or compiled where that is worth it: at once if `quick` is
-    False."""
+    """`interior_point.minimise` by NumPy, and compiled from the iteration on at which that is worth
+    it: the first if `quick` is False."""
     leaves, structure = jax.tree_util.tree_flatten((program, start))
     size = (structure, *map(np.shape, leaves))
-    spent = _on_host_so_far.get(size, 0.0)
-    if not quick or spent > _WORTH_COMPILING:
-        given = jax.device_put((program, limits, start, options))
-        return jax.device_get(compiled(interior_point.minimise, quick)(*given))
-    began = time.perf_counter()
-    solution = interior_point.minimise(program, limits, start, options)
+    spent, began = _on_host_so_far.get(size, 0.0), time.perf_counter()
+    least = _WORTH_COMPILING if quick else 0.0
+    further = lambda: spent + time.perf_counter() - began < least
+    state = interior_point.begun(program, limits, start, options)
+    state = interior_point.iterated(program, limits, options, state, further)
     _on_host_so_far[size] = spent + time.perf_counter() - began
-    return solution
+    if state.status == interior_point.RUNNING:
+        given = jax.device_put((program, limits, options, state))
+        state = jax.device_get(compiled(interior_point.iterated, quick)(*given))
+    return interior_point.ended(program, state)
 
 
 @jax.custom_batching.sequential_vmap

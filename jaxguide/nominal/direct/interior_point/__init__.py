@@ -10,9 +10,13 @@ kind of step, so that the factorisation is compiled once (`loop`).
 J. Optim. 19 (2009), for the adaptive barrier.
 """
 
+from jaxguide.nominal.direct.interior_point.loop import begun as begun
+from jaxguide.nominal.direct.interior_point.loop import ended as ended
+from jaxguide.nominal.direct.interior_point.loop import iterated as iterated
 from jaxguide.nominal.direct.interior_point.loop import minimise as minimise
 from jaxguide.nominal.direct.interior_point.state import CONVERGED as CONVERGED
 from jaxguide.nominal.direct.interior_point.state import INFEASIBLE as INFEASIBLE
+from jaxguide.nominal.direct.interior_point.state import RUNNING as RUNNING
 from jaxguide.nominal.direct.interior_point.state import STALLED as STALLED
 from jaxguide.nominal.direct.interior_point.state import TOO_MANY as TOO_MANY
 from jaxguide.nominal.direct.interior_point.state import Options as Options

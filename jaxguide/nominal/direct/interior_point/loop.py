@@ -1,6 +1,8 @@
 """The iterations: one step after another, until the first-order conditions hold or none helps."""
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 
@@ -43,14 +45,44 @@ def minimise(program: Transcription, limits: Limits, start: Start, options: Opti
 
     **Source:** Waechter & Biegler (2006), Algorithm A.
     """
+    return ended(
+        program, iterated(program, limits, options, begun(program, limits, start, options))
+    )
+
+
+def begun(program: Transcription, limits: Limits, start: Start, options: Options) -> State:
+    """The state before the first iteration of `minimise`."""
     impossible = xp.any(flattened(limits.lo) > flattened(limits.hi))
     impossible = impossible | (limits.hi.times[1] <= limits.lo.times[0])
-    setup = Setup(program, Box(*map(flattened, boxed(limits))), options)
-    state = _first_state(setup, start, impossible)
-    end = loop(lambda s: s.status == RUNNING, lambda s: _advanced(setup, s), state)
+    return _first_state(_setup(program, limits, options), start, impossible)
+
+
+def iterated(
+    program: Transcription,
+    limits: Limits,
+    options: Options,
+    state: State,
+    further: Callable[[], bool] | None = None,
+) -> State:
+    """The state after all iterations; on the host, before one for which `further` is false."""
+    setup = _setup(program, limits, options)
+
+    def going(s: State) -> Any:
+        running = s.status == RUNNING
+        return running if further is None else running and further()
+
+    return loop(going, lambda s: _advanced(setup, s), state)
+
+
+def ended(program: Transcription, end: State) -> Solution:
+    """The solution in the last state."""
     w, zl, zu = (program.shaped(a) for a in (end.w, end.zl, end.zu))
     _, c = program.objective_and_residual(w)
     return Solution(w, end.y, zl, zu, end.mu, end.status, end.iteration, end.error, largest(c))
+
+
+def _setup(program: Transcription, limits: Limits, options: Options) -> Setup:
+    return Setup(program, Box(*map(flattened, boxed(limits))), options)
 
 
 def _first_state(setup: Setup, start: Start, impossible: Array) -> State:
