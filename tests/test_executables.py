@@ -16,6 +16,7 @@ import pytest
 
 from jaxguide import cli
 from jaxguide.host import cache, executables
+from jaxguide.host.compilation import quick_compilation
 from jaxguide.host.executables import kept
 
 
@@ -54,6 +55,7 @@ PROGRAM = """
 import json, jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 jax.devices()
+from jaxguide.host.compilation import quick_compilation
 from jaxguide.host.executables import kept
 def f(x, k, key):
     return jax.numpy.cumsum(jax.numpy.sin(k * x)), jax.random.normal(key), np.float32
@@ -129,8 +131,10 @@ def test_large_constants_are_in_the_key(folder):
     assert cache.state().entries == 2
 
 
-def test_under_a_trace_it_is_the_function(folder):
-    f = kept(lambda x, k: jnp.sum(x**k))
+@pytest.mark.parametrize("options", [None, quick_compilation])
+def test_under_a_trace_it_is_the_function(folder, options):
+    """Options of a compiler are for a program of its own: inside another they are refused."""
+    f = kept(lambda x, k: jnp.sum(x**k), options)
     x = jnp.arange(1.0, 4.0)
     np.testing.assert_allclose(jax.grad(f)(x, 3), 3 * x**2, rtol=1e-15)
     np.testing.assert_array_equal(jax.vmap(lambda v: f(v, 3))(x[:, None]), x**3)

@@ -83,6 +83,11 @@ class Kept:
         return eqx.filter_jit(self.__wrapped__, **options)
 
     @functools.cached_property
+    def _inside(self) -> Any:
+        """The jitted function under a trace, which takes no options of its own."""
+        return eqx.filter_jit(self.__wrapped__)
+
+    @functools.cached_property
     def _flat(self) -> Any:
         """The function jitted, of arrays and what is left."""
         function = self.__wrapped__
@@ -102,7 +107,7 @@ class Kept:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         given = _given(args, kwargs)
         if given is None:
-            return self._jitted(*args, **kwargs)
+            return self._inside(*args, **kwargs)
         arrays, static, kinds = given
         try:
             out = None
