@@ -203,13 +203,3 @@ def traced_once(function: Callable) -> Callable:
         return function(*args) if host else program(*args)
 
     return called
-
-
-_LADDER = 64  # the least number of points that a program of the host evaluates
-
-
-def padded_to_ladder(a: Any) -> Any:
-    """`a` (point, ...) of the host with its last entry repeated, up to a power of two: few programs
-    serve all meshes."""
-    size = max(_LADDER, 1 << (len(a) - 1).bit_length())
-    return np.concatenate([a, np.broadcast_to(a[-1:], (size - len(a), *a.shape[1:]))])

@@ -1,9 +1,11 @@
 """The command line on stand-ins for the library: what it prints where, and how it ends."""
 
+import io
 import json
 import os
 import subprocess
 import sys
+import time
 import types
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from matplotlib.figure import Figure
 
 import jaxguide
 from jaxguide import cli, doctor, plotting, problems, reproduce
+from jaxguide.host.progress import spoken
 from jaxguide.reproduce.report import Report
 from jaxguide.types import RESULTS, UnknownName
 
@@ -282,3 +285,27 @@ def test_progress_meters_fit_diffrax():
     assert state[0].tasks[0].percentage == 50.0
     bar.close(state)
     assert NoProgress().step(NoProgress().init(), 0.5) is None
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stderr", "wanted"), [(Terminal(), True), (Terminal(), False), (io.StringIO(), True)]
+)
+def test_long_work_says_what_it_is_at(monkeypatch, stderr, wanted):
+    """On a terminal alone, and from a while on; it ends with a shown cursor, on failure too."""
+    monkeypatch.setattr(sys, "stderr", stderr)
+    with pytest.raises(ZeroDivisionError), spoken("Kink", wanted, delay=0.0) as say:
+        time.sleep(0.3)  # the line begins in a thread of its own
+        say("breaks moved")
+        time.sleep(0.3)
+        raise ZeroDivisionError
+    shown = stderr.getvalue()
+    if wanted and stderr.isatty():
+        assert "Kink: breaks moved" in shown
+        assert "\x1b[?25h" in shown.rsplit("breaks moved", 1)[1]
+    else:
+        assert shown == ""

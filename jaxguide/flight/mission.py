@@ -137,7 +137,7 @@ def _hold(value: Any, role: str) -> Any:
 
 def _initial_state(plant: Problem, initial_state: Any) -> Float[Array, " n"]:
     """`initial_state` as an array of the plant's size, refused with a `ValueError` otherwise."""
-    x0 = as_float(initial_state)
+    x0 = as_float(jnp.asarray(initial_state))
     if x0.shape != (plant.n,):
         raise ValueError(
             f"Mission: initial_state has shape {x0.shape}; give {plant.n} numbers, one for each of "
