@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxguide.problem.boundary import initial_entries, initial_values, initially_free, start_control
 from jaxguide.problem.parameters import with_parameters
@@ -20,7 +19,7 @@ _ROUNDING = 1e-9
 
 
 @jax.jit
-def _start(problem: Problem) -> tuple[Array, ...]:
+def _start(problem: Problem) -> tuple[Any, ...]:
     """Times, state, control and rate from which a search would start."""
     dtype = jnp.result_type(float)
     times = (problem.initial_time, problem.final_time)
