@@ -6,6 +6,7 @@ of theirs: a folder or a file that others own or may write is not read.
 """
 
 import contextlib
+import functools
 import hashlib
 import os
 import shutil
@@ -38,7 +39,11 @@ class CacheState(NamedTuple):
 def folder() -> Path | None:
     """The folder `JAXGUIDE_CACHE_DIR`; without it `jaxguide/programs` in the user's cache folder.
     None if the variable is empty, or where files have no owner that could be checked."""
-    given = os.environ.get(VARIABLE)
+    return _folder(*(os.environ.get(name) for name in (VARIABLE, "XDG_CACHE_HOME", "HOME")))
+
+
+@functools.lru_cache(16)  # every call of a program asks
+def _folder(given: str | None, *_: str | None) -> Path | None:
     if given == "" or not hasattr(os, "geteuid"):
         return None
     try:
