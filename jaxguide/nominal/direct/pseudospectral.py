@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxguide.arrays import Array, on_numpy, xp
 from jaxguide.host.compilation import compiled, without_collection
@@ -197,7 +198,7 @@ class Pseudospectral(Method):
         """The extremal on the fixed mesh. Where `solve` would refine it on the host, one short of
         `mesh_tolerance` is `RESULTS.underresolved`."""
         program, start, options = self.prepared(problem, guess)
-        starts = self._starts(problem, program, start, guess)
+        starts = self._starts(program, start, guess)
         extremal = finished(problem, program, starts, options)
         if not self.refinements:
             return extremal
@@ -269,17 +270,20 @@ class Pseudospectral(Method):
             more(known.loose, whole.m),
         )
 
+    def _fractions(self, dtype: Any) -> Float[Array, " edge"]:
+        """The break points of the horizon, from 0 to 1."""
+        if self.fractions is None:
+            return xp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
+        return xp.asarray(self.fractions, dtype)
+
     def _starts(
-        self, problem: Problem, program: Transcription, start: interior_point.Start, guess: Any
+        self, program: Transcription, start: interior_point.Start, guess: Any
     ) -> interior_point.Start:
         """`start`, and without a guess `RETRIES` random ones, along a leading axis."""
         first = jax.tree_util.tree_map(lambda a: jnp.asarray(a)[None], start)
         if guess is not None:
             return first
-        if self.fractions is None:
-            fractions = jnp.linspace(0.0, 1.0, self.segments + 1, dtype=program.dtype)
-        else:
-            fractions = jnp.asarray(self.fractions, program.dtype)
+        fractions = self._fractions(program.dtype)
 
         def drawn(key: Array) -> interior_point.Start:
             # Copies, whose cached arrays belong to this trace.
@@ -308,10 +312,7 @@ class Pseudospectral(Method):
         on_host = on_numpy(*jax.tree_util.tree_leaves(problem))
         # One array of JAX's would bring the whole algebra to it, operation by operation.
         whole = jax.device_get(self.whole(problem)) if on_host else self.whole(problem)
-        if self.fractions is None:
-            fractions = xp.linspace(0.0, 1.0, self.segments + 1, dtype=dtype)
-        else:
-            fractions = xp.asarray(self.fractions, dtype)
+        fractions = self._fractions(dtype)
         unit = blank_scale(whole, len(self.knots))
         # At the end of an infinite horizon time stands still: no node may lie there.
         family = "lgr-left" if isinstance(problem, Endless) else self.grid
