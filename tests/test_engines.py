@@ -1,5 +1,5 @@
-"""The direct method's two engines, NumPy's on the host and XLA's: that they agree, how one takes over
-from the other, and what a first answer compiles."""
+"""The direct method's two engines, NumPy's on the host and XLA's: that they agree, how one takes
+over from the other, and what a first answer compiles."""
 
 import dataclasses
 import subprocess

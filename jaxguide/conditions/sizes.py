@@ -76,21 +76,11 @@ def sizes_of(
     return Sizes(x_size, u_size, horizon, cost, hamiltonian, positive(path), end)
 
 
-def end_sizes(
-    problem: Problem,
-    t: Float[Array, " node"],
-    x: Float[Array, "node n"],
-    x_size: Float[Array, " n"],
-) -> Float[Array, " q"]:
-    """Sizes of the endpoint constraints: how much they change when states at both ends and times
-    change by their sizes, or their largest bound."""
-    ends = end_slopes(problem, x[0], x[-1], t[0], t[-1])
-    return _end_sizes(problem, ends, t[-1] - t[0], x_size)
-
-
 def _end_sizes(
     problem: Problem, ends: EndSlopes, horizon: Float[Array, ""], x_size: Float[Array, " n"]
 ) -> Float[Array, " q"]:
+    """Sizes of the endpoint constraints: how much they change when states at both ends and times
+    change by their sizes, or their largest bound."""
     size = xp.concatenate([x_size, xp.broadcast_to(horizon, (2,)), x_size])
     end = _known(ends.by[1:]) @ size
     return positive(xp.maximum(end, largest_bound(problem.endpoint_bounds, end.shape[0])))
