@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 from typing import Any
 
-import diffrax
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -17,11 +17,12 @@ State = Float[Array, " state"]
 Control = Float[Array, " control"]
 
 
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+class RESULTS(eqx.Enumeration):
     """How a computation ended: `successful`, or a reason whose message names the remedy.
 
-    Extends the enumerations of Diffrax, Optimistix and Lineax, so that `RESULTS.promote` lifts
-    theirs. Members compare with `==` and merge with `RESULTS.where`, also under a trace.
+    Members compare with `==` and merge with `RESULTS.where`, also under a trace. It does not extend
+    the enumerations of Diffrax and its kin, which take a quarter of a second to import: where they
+    are called, their reasons are translated.
     """
 
     successful = ""
@@ -83,6 +84,14 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     diverged = (
         "The flight left finite numbers: the plant diverged. Look at this case's dispersion, or "
         "cap the command."
+    )
+    steps_exhausted = (
+        "An adaptive integration took all its steps within one sample: raise `max_steps`, loosen "
+        "`tolerance`, or look for a jump or a growing oscillation in the dynamics."
+    )
+    integration_failed = (
+        "An adaptive integration found no step that meets its tolerance, or left finite numbers: "
+        "look at this case's rates, or fly it with fixed steps (jg.RungeKutta4)."
     )
     undefined = (
         "A cost, constraint or rate of the problem, or a derivative of one, is NaN or infinite "

@@ -1,6 +1,5 @@
 """The costly checks: the control flown through the dynamics, and conjugate points."""
 
-import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -10,6 +9,7 @@ from jaxguide.linalg import power_of_two
 from jaxguide.neighboring.linearization import terminal_conditions
 from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, solve_sweeps
 from jaxguide.neighboring.sufficiency import conjugate_ahead
+from jaxguide.nominal.steps import adaptive
 from jaxguide.trajectory import Extremal
 
 # Tolerance and most steps of the adaptive integrator, and the relative error up to which the flown
@@ -35,21 +35,9 @@ def _propagate(extremal: Extremal, size: Float[Array, " n"]) -> Float[Array, "no
     units of their `size`, as powers of two, so that its tolerance has none of the user's."""
     problem, unit = extremal.problem, power_of_two(size)
     control = lambda t: extremal.interpolate(extremal.u, t)
-    rate = lambda t, y, args: problem.dynamics(t, y * unit, control(t)) / unit
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
-        diffrax.Dopri8(),
-        extremal.t[0],
-        extremal.t[-1],
-        None,
-        extremal.x[0] / unit,
-        stepsize_controller=diffrax.PIDController(rtol=_FLOWN_TO, atol=_FLOWN_TO),
-        saveat=diffrax.SaveAt(ts=extremal.t),
-        max_steps=_STEPS,
-        throw=False,
-    )
-    assert solution.ys is not None
-    return solution.ys * unit[None]
+    rate = lambda t, y: problem.dynamics(t, y * unit, control(t)) / unit
+    t, y = extremal.t, extremal.x[0] / unit
+    return adaptive(rate, y, t[0], t[-1], _FLOWN_TO, _STEPS, at=t).ys * unit[None]
 
 
 def _conjugate(extremal: Extremal) -> Bool[Array, " break"]:

@@ -4,7 +4,6 @@ import abc
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.laws.lanes import Lanes, lanes
 from jaxguide.laws.law import Command
+from jaxguide.nominal.steps import adaptive
 from jaxguide.types import RESULTS
 
 Rate = Callable[[Any, Any, Any], Any]  # (t, x, u) -> dx/dt
@@ -154,22 +154,21 @@ class Adaptive(Integrator):
     def across(
         self, rate: Rate, flown: Command, t: Any, t_next: Any, x: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], RESULTS]:
+        import diffrax  # only here: see nominal/steps.py
+
         # Diffrax takes no interval without length: one of length 1 is flown instead, and not used.
         empty = t_next == t
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, x, args: rate(t, x, flown(t))),
-            diffrax.Dopri8(),
-            t,
-            t + jnp.where(empty, 1.0, t_next - t),
-            None,
-            x,
-            stepsize_controller=diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance),
-            max_steps=self.max_steps,
-            saveat=diffrax.SaveAt(t1=True),
-            throw=False,
+        until = t + jnp.where(empty, 1.0, t_next - t)
+        held = lambda t, x: rate(t, x, flown(t))
+        solution = adaptive(held, x, t, until, self.tolerance, self.max_steps)
+        theirs = diffrax.RESULTS
+        result = RESULTS.where(
+            solution.result == theirs.max_steps_reached,
+            RESULTS.steps_exhausted,
+            RESULTS.integration_failed,
         )
-        assert solution.ys is not None
-        result = RESULTS.where(empty, RESULTS.successful, RESULTS.promote(solution.result))
+        fine = empty | (solution.result == theirs.successful)
+        result = RESULTS.where(fine, RESULTS.successful, result)
         return jnp.where(empty, x, solution.ys[0]), result
 
 

@@ -1,9 +1,13 @@
-"""Fixed Runge-Kutta steps of order four and eight: differentiable both ways and to any order."""
+"""Runge-Kutta steps: fixed ones of order four and eight, differentiable both ways and to any order,
+and Diffrax's adaptive ones, of order eight.
+
+Diffrax takes a quarter of a second to import, and most processes do without: it is imported where
+it is used.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -19,6 +23,8 @@ def dopri8(
     The tableau is Diffrax's; its own `step` loops in a way that has no forward mode. A scan over
     the stages compiles the right-hand side once.
     """
+    import diffrax
+
     tableau = diffrax.Dopri8.tableau
     stages = tableau.num_stages
     a = np.zeros((stages, stages))
@@ -42,6 +48,59 @@ def dopri8(
 
     _, ys = jax.lax.scan(step, y, (times[:-1], jnp.diff(times)))
     return jnp.concatenate([y[None], ys])
+
+
+def adaptive(
+    rate: Callable[[Any, Any], Any],
+    y: Float[Array, " d"],
+    t0: Any,
+    t1: Any,
+    tolerance: float,
+    max_steps: int,
+    at: Array | None = None,
+) -> Any:
+    """Diffrax's solution of y' = rate(t, y) at `at`, or at `t1`, whose every step errs by
+    `tolerance`, relative and absolute."""
+    import diffrax
+
+    saved = diffrax.SaveAt(t1=True) if at is None else diffrax.SaveAt(ts=at)
+    return _diffeqsolve(rate, y, t0, t1, tolerance, max_steps, saveat=saved)
+
+
+def adaptive_steps(
+    rate: Callable[[Any, Any], Any],
+    y: Float[Array, " d"],
+    t0: Any,
+    t1: Any,
+    tolerance: float,
+    max_steps: int,
+) -> tuple[Float[Array, " step"], Float[Array, "step d"]]:
+    """Times (inf beyond the last) and values of the steps of such a solution, which has no
+    derivatives."""
+    import diffrax
+
+    steps, light = diffrax.SaveAt(steps=True), diffrax.ForwardMode()
+    solution = _diffeqsolve(rate, y, t0, t1, tolerance, max_steps, saveat=steps, adjoint=light)
+    return solution.ts, solution.ys
+
+
+def _diffeqsolve(
+    rate: Callable, y: Array, t0: Any, t1: Any, tolerance: float, max_steps: int, **options: Any
+) -> Any:
+    import diffrax
+
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: rate(t, y)),
+        diffrax.Dopri8(),
+        t0,
+        t1,
+        None,
+        y,
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        max_steps=max_steps,
+        throw=False,
+        **options,
+    )
 
 
 def rk4(rate: Any, y: Array, times: Float[Array, " k"]) -> Float[Array, "k d"]:

@@ -4,7 +4,6 @@ Host only."""
 import dataclasses
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxguide.linalg import power_of_two
+from jaxguide.nominal.steps import adaptive
 from jaxguide.problem import Problem
 from jaxguide.solving.given import default_method
 from jaxguide.solving.solve import solve
@@ -85,22 +85,11 @@ def _flown(extremal: Extremal, x: Array, t0: Array, t1: Array) -> tuple[Array, A
     problem, size = extremal.problem, extremal.sizes()
     unit = power_of_two(jnp.append(size.x, size.cost))
 
-    def rate(t: Any, y: Array, args: Any) -> Array:
+    def rate(t: Any, y: Array) -> Array:
         x, u = (y * unit)[:-1], extremal.point(t).u
         return jnp.append(problem.dynamics(t, x, u), problem.running_cost(t, x, u)) / unit
 
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
-        diffrax.Dopri8(),
-        t0,
-        t1,
-        None,
-        jnp.append(x, 0.0) / unit,
-        stepsize_controller=diffrax.PIDController(rtol=1e-11, atol=1e-11),
-        max_steps=16384,
-        throw=False,
-    )
-    assert solution.ys is not None
+    solution = adaptive(rate, jnp.append(x, 0.0) / unit, t0, t1, 1e-11, 16384)
     y = solution.ys[-1] * unit
     return y[:-1], y[-1]
 

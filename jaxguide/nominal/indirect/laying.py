@@ -1,6 +1,5 @@
 """Where the mesh of a shot extremal breaks: where an adaptive integrator steps."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,6 +7,7 @@ from jaxtyping import Array, Float
 from jaxguide.conditions.canonical import canonical_rates
 from jaxguide.linalg import power_of_two
 from jaxguide.nominal.indirect.boundary import Unknowns, horizon
+from jaxguide.nominal.steps import adaptive_steps
 from jaxguide.problem import Problem
 
 _UNIFORM = 0.2  # share of the breaks that are spaced evenly, so that no segment is a whole horizon
@@ -45,24 +45,10 @@ def _steps(
     times = t0 + (tf - t0) * jnp.linspace(0.0, 1.0, arcs + 1, dtype=z.starts.dtype)
     y = jnp.concatenate([z.starts, jnp.zeros((arcs, 1), z.starts.dtype)], axis=1)
     unit = _units(y)
-    rate = lambda t, s, args: canonical_rates(args, t, s * unit) / unit
-    fly = lambda s, a, b: diffrax.diffeqsolve(
-        diffrax.ODETerm(rate),
-        diffrax.Dopri8(),
-        a,
-        b,
-        None,
-        s,
-        args=problem,
-        saveat=diffrax.SaveAt(steps=True),
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-        max_steps=max_steps,
-        adjoint=diffrax.ForwardMode(),  # never differentiated: the lightest there is
-        throw=False,
-    )
-    solution = jax.vmap(fly)(y / unit[None], times[:-1], times[1:])
-    assert solution.ts is not None and solution.ys is not None
-    return solution.ts, solution.ys * unit[None, None]
+    rate = lambda t, s: canonical_rates(problem, t, s * unit) / unit
+    fly = lambda s, a, b: adaptive_steps(rate, s, a, b, tolerance, max_steps)
+    ts, ys = jax.vmap(fly)(y / unit[None], times[:-1], times[1:])
+    return ts, ys * unit[None, None]
 
 
 def _units(y: Float[Array, "arc two_n_1"]) -> Float[Array, " two_n_1"]:
