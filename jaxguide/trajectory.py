@@ -13,6 +13,7 @@ from jaxguide.arrays import Array, put
 from jaxguide.bounds import bounds_of, size_along
 from jaxguide.conditions.control import polish_control
 from jaxguide.conditions.sizes import Sizes, sizes_of
+from jaxguide.host.remembered import remembered
 from jaxguide.problem import Chosen, Problem
 from jaxguide.spectral import interpolate
 from jaxguide.types import RESULTS
@@ -134,7 +135,7 @@ class Extremal(Trajectory):
     def stated(self) -> Problem:
         """`problem` with its static parameters as a search for them would start here: the host has
         its functions compiled already."""
-        return self.problem if self.chosen is None else self.chosen.unsettled(self.problem)
+        return _stated(self)
 
     def sizes(self) -> Sizes:
         """How large each quantity is along the extremal: what its errors are relative to."""
@@ -179,6 +180,13 @@ class Extremal(Trajectory):
             parts = (self.by_segment(self.x), self.control_by_segment(), self.costate_by_segment())
             y = self._interpolate(jnp.concatenate(parts, axis=2), t)
         return Point(y[:n], y[n : n + m], y[n + m :])
+
+
+@remembered
+def _stated(extremal: Extremal) -> Problem:
+    if extremal.chosen is None:
+        return extremal.problem
+    return extremal.chosen.unsettled(extremal.problem)
 
 
 @jax.jit

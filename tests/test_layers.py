@@ -57,7 +57,15 @@ ORDER: dict[str, tuple[str, ...]] = {
         "matrices",
         "either",
     ),
-    "problem": ("statement", "parameters", "counts", "points", "boundary", "validation"),
+    "problem": (
+        "statement",
+        "parameters",
+        "counts",
+        "points",
+        "boundary",
+        "validation",
+        "told",
+    ),
     "conditions": ("hamiltonian", "control", "canonical", "angles", "units", "sizes", "bounded"),
     "transforms": ("wrapped", "integrals", "relaxed", "endless", "phased", "state_as_time"),
     "nominal": (

@@ -9,6 +9,7 @@ import importlib.metadata
 import inspect
 import operator
 import os
+import pickle
 import platform
 import re
 import sys
@@ -23,7 +24,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
-from jaxguide.host import cache, flags
+from jaxguide.host import cache, fingerprint, flags
 
 # A call of Python out of a program holds an address of this process.
 _CALLBACK = re.compile(r"custom_call @\w*callback")
@@ -113,7 +114,7 @@ class Kept:
             out = None
             if not _stands_aside(arrays):
                 program = self._program((static, kinds, _settings()))
-                out = program.run(self._flat, arrays, static, self._options)
+                out = program.run(self, arrays, static, (args, kwargs))
             moved, still = jax.block_until_ready(self._flat(arrays, static)) if out is None else out
         except jax.errors.JaxRuntimeError:  # Equinox says its own errors better
             return self._jitted(*args, **kwargs)
@@ -203,52 +204,85 @@ class _Program:
         self._made = False
         self._lock = threading.Lock()
 
-    def run(self, flat: Any, arrays: list[Any], static: _Static, options: dict) -> Any:
+    def run(self, of: Kept, arrays: list[Any], static: _Static, arguments: tuple) -> Any:
         """What it gives for `arrays`, ready; None if it cannot be kept."""
         if not self._made:
             with self._lock:
                 if not self._made:
-                    self._call, out = _made(flat, arrays, static, options)
+                    self._call, out = _made(of, arrays, static, arguments)
                     self._made = True
                     if out is not None:
                         return out
         return None if self._call is None else jax.block_until_ready(self._call(arrays))
 
 
-def _made(flat: Any, arrays: list[Any], static: _Static, options: dict) -> tuple[Any, Any]:
+def _made(of: Kept, arrays: list[Any], static: _Static, arguments: tuple) -> tuple[Any, Any]:
     """The program loaded and what it gave for `arrays`, or else compiled and kept, and None; two
     None if it calls back into Python."""
+    known = _told_key(of, arguments)
+    if known is not None and (found := _found(known, None, arrays)) is not None:
+        return found
+    flat, options = of._flat, of._options
     with without_collection():
         traced = flat.trace(arrays, static)
         lowered = traced.lower()
     text = lowered.as_text()
     if _CALLBACK.search(text):
         return None, None
-    # Types of the results and their weakness do not stand in the text.
-    types = [str(aval) for aval in (*traced.jaxpr.in_avals, *traced.jaxpr.out_avals)]
-    key = _key(text, *types, repr(sorted(options.items())), repr(_settings()))
-    data = cache.read(key)
-    if data is not None:
-        try:
-            return _loaded(data, lowered, arrays)
-        except Exception:  # unpickling and XLA's loader may raise anything
-            cache.remove(key)
+    structure = jax.tree_util.tree_unflatten(lowered.out_tree, [0] * lowered.out_tree.num_leaves)
+    key, packed = known, _packed(structure)
+    if key is None or packed is None:
+        # Types of the results and their weakness do not stand in the text.
+        types = [str(aval) for aval in (*traced.jaxpr.in_avals, *traced.jaxpr.out_avals)]
+        key = _key(text, *types, repr(sorted(options.items())), repr(_settings()))
+        if (found := _found(key, lowered.out_tree, arrays)) is not None:
+            return found
+        packed = b""
     compiled = lowered.compile()
     try:
-        cache.keep(key, serialize_executable.serialize(compiled)[0])
+        cache.keep(key, pickle.dumps((serialize_executable.serialize(compiled)[0], packed)))
     except Exception:  # a backend may have any reason, of any type, not to serialise
         pass
     return compiled, None
 
 
-def _loaded(data: bytes, lowered: Any, arrays: list[Any]) -> tuple[Any, Any]:
-    """The executable in `data`, and what it gives for `arrays`: one whose parts are missing fails
-    only when it is run."""
-    with _without_noise():
-        program = serialize_executable.deserialize_and_load(
-            data, lowered.in_tree, lowered.out_tree, execution_devices=jax.devices()[:1]
-        )
-    return program, jax.block_until_ready(program(arrays))
+def _told_key(of: Kept, arguments: tuple) -> str | None:
+    """The key by what decides the program, which needs no trace; None where that is not told."""
+    try:
+        told = fingerprint.told(of.__wrapped__, arguments)
+    except fingerprint.Untold:
+        return None
+    options = getattr(of._of_compiler, "__qualname__", "")
+    return _key("told", told, fingerprint.known_code(), options, repr(_settings()))
+
+
+def _packed(structure: Any) -> bytes | None:
+    """The structure of a result, a number at each array; None where it cannot be packed."""
+    try:
+        return pickle.dumps(structure)
+    except Exception:  # a class may have any reason not to be pickled
+        return None
+
+
+def _found(key: str, structure: Any, arrays: list[Any]) -> tuple[Any, Any] | None:
+    """The program kept by `key` and what it gives for `arrays`: one whose parts are missing fails
+    only when it is run. None if there is none. `structure`: of its result; None: as kept."""
+    data = cache.read(key)
+    if data is None:
+        return None
+    try:
+        program, packed = pickle.loads(data)
+        if structure is None:
+            structure = jax.tree_util.tree_structure(pickle.loads(packed))
+        given = jax.tree_util.tree_structure(((arrays,), {}))
+        with _without_noise():
+            loaded = serialize_executable.deserialize_and_load(
+                program, given, structure, execution_devices=jax.devices()[:1]
+            )
+        return loaded, jax.block_until_ready(loaded(arrays))
+    except Exception:  # unpickling and XLA's loader may raise anything
+        cache.remove(key)
+        return None
 
 
 def _key(*parts: str) -> str:

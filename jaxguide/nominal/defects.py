@@ -2,12 +2,15 @@
 
 from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxguide.arrays import Array, xp
 from jaxguide.bounds import largest_bound, positive, size_along
 from jaxguide.conditions.bounded import oversteps_between
 from jaxguide.conditions.sizes import state_sizes
+from jaxguide.host.remembered import remembered
+from jaxguide.problem import Problem
 from jaxguide.problem.points import rates
 from jaxguide.spectral import nodes_lg
 from jaxguide.spectral.either import differentiating, interpolating, to_legendre
@@ -54,6 +57,7 @@ def _slopes_of_states(
     return rate / xp.where(half > 0, half, 1.0)[:, None, None]
 
 
+@remembered
 def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     """By segment, the largest of what its polynomials miss between the nodes, each relative to its
     size:
@@ -67,30 +71,40 @@ def segment_errors(extremal: Extremal) -> Float[Array, " segment"]:
     gauss, weights = (xp.asarray(a, extremal.t.dtype) for a in nodes_lg(2 * degree))
     half = xp.diff(extremal.breaks) / 2
     size = state_sizes(problem, extremal.t, extremal.x, extremal.u)
-    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
     t, x, u = _between(extremal, gauss)
-    back = lambda a: a.reshape(*t.shape, *a.shape[1:])
-    f, cost, h = map(back, rates(problem, *map(flat, (t, x, u))))
+    own = (extremal.by_segment(extremal.t[:, None])[..., 0], extremal.by_segment(extremal.x))
+    own = (*own, extremal.control_by_segment())
+    of_u = size_along(extremal.u, problem.control_bounds)
+    away = (t, x + size[None, None], u + of_u[None, None])
+    (f, cost, h), (_, known, _), (_, far, _) = _rates_at(problem, (t, x, u), own, away)
     gap = xp.abs(_slopes_of_states(extremal, gauss) - f)
     gap = half[:, None] * xp.einsum("g,sgk->sk", weights, gap) / size[None]
 
-    parts = (extremal.by_segment(extremal.t[:, None])[..., 0], extremal.by_segment(extremal.x))
-    parts = (*parts, extremal.control_by_segment())
     # Points that are no nodes of the quadrature have the weight zero.
-    own = 2 * to_legendre(nodes)[0]
-    known = rates(problem, *map(flat, parts))[1].reshape(parts[0].shape)
-    known = xp.where(xp.abs(own)[None] > _ROUNDING, known, 0.0) @ own
+    share = 2 * to_legendre(nodes)[0]
+    known = xp.where(xp.abs(share)[None] > _ROUNDING, known, 0.0) @ share
     missed = half * xp.abs(cost @ weights - known)
     whole = xp.sum(half * (xp.abs(cost) @ weights))
-    of_u = size_along(extremal.u, problem.control_bounds)
-    away = xp.abs(rates(problem, *map(flat, (t, x + size[None, None], u + of_u[None, None])))[1])
-    least = _LEAST_COST * 2 * xp.sum(half) * xp.median(xp.where(xp.isfinite(away), away, 0.0))
+    far = xp.where(xp.isfinite(far), xp.abs(far), 0.0)
+    least = _LEAST_COST * 2 * xp.sum(half) * xp.median(far)
     missed = missed / positive(xp.maximum(whole, least))
 
     sizes = (_path_sizes(h, problem.path_bounds), size)
     path, state = oversteps_between(problem, nodes_lg(2 * degree)[0], (h, x), sizes)
     worst = lambda a: xp.max(a, axis=(1, 2), initial=0.0)
     return xp.max(xp.stack([xp.max(gap, axis=1), missed, worst(state), worst(path)]), axis=0)
+
+
+def _rates_at(problem: Problem, *points: tuple[Array, Array, Array]) -> list[list[Array]]:
+    """`rates` at several kinds of points in every segment, by one evaluation of all."""
+    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])
+    all_points = [xp.concatenate([flat(a) for a in kind]) for kind in zip(*points, strict=True)]
+    ends = np.cumsum([p[0].shape[0] * p[0].shape[1] for p in points])[:-1]
+    parts = [xp.split(value, ends) for value in rates(problem, *all_points)]
+    return [
+        [part.reshape(*p[0].shape, *part.shape[1:]) for part in kind]
+        for p, kind in zip(points, zip(*parts, strict=True), strict=True)
+    ]
 
 
 def _path_sizes(h: Float[Array, "segment point p"], bounds: Any) -> Float[Array, " p"]:

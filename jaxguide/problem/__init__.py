@@ -1,5 +1,6 @@
 """What a user states: Problem P of the 2012 review, eq. (2)."""
 
+from jaxguide.problem import told as told
 from jaxguide.problem.boundary import initial_bounds as initial_bounds
 from jaxguide.problem.boundary import initial_entries as initial_entries
 from jaxguide.problem.boundary import initial_values as initial_values

@@ -64,5 +64,6 @@ def start_control(problem: Problem, dtype: Any) -> Float[Array, " m"]:
     """
     lo, hi = bounds_of(problem.control_bounds, problem.m, dtype)
     finite = xp.isfinite(lo) & xp.isfinite(hi)
-    middle = xp.where(finite, (lo + hi) / 2, xp.clip(xp.zeros_like(lo), lo, hi))
-    return middle + 0.1 * xp.where(finite, (hi - lo) / 2, 1.0)
+    low, high = xp.where(finite, lo, -1.0), xp.where(finite, hi, 1.0)
+    middle = xp.where(finite, (low + high) / 2, xp.clip(xp.zeros_like(lo), lo, hi))
+    return middle + 0.1 * (high - low) / 2

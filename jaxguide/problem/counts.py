@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxguide.host.remembered import remembered
 from jaxguide.problem.parameters import with_parameters
 from jaxguide.problem.statement import Problem
 
@@ -20,6 +21,7 @@ def endpoint_count(problem: Problem) -> int:
     return _size(*_kind(problem), "endpoint_constraints")
 
 
+@remembered
 def _kind(problem: Problem) -> tuple[Any, tuple[Any, ...]]:
     leaves, structure = jax.tree_util.tree_flatten(problem)
     return structure, tuple(map(jax.typeof, leaves))

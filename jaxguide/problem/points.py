@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxguide.arrays import Array, on_numpy, xp
 from jaxguide.host.compilation import compiled
+from jaxguide.host.remembered import remembered
 from jaxguide.problem.counts import count, endpoint_count
 from jaxguide.problem.parameters import Path, parameters, placed_at, with_parameters
 from jaxguide.problem.statement import Problem, start_value
@@ -249,12 +250,17 @@ def _as_points(problem: Problem, t: Any, x: Any, u: Any) -> Any:
     with dt/dtau of each."""
     size = np.max(np.abs(t), initial=0.0)
     after = t + (size if size > 0 else 1.0)
-    one, p = unit_scale(problem), start_parameters(problem)
+    one, p = _user_units(problem)
     q = [x, u, t[:, None], after[:, None], np.broadcast_to(p, (len(t), len(p)))]
     start, weight = np.full_like(t, -1.0), np.ones_like(t)
     ends = np.concatenate([x[0], t[[0, -1]], p, x[-1]])
     points = (start, weight, np.concatenate(q, axis=1))
     return point_functions(problem, one), points, (ends,), ((after - t) / 2)[:, None]
+
+
+@remembered
+def _user_units(problem: Problem) -> tuple[Scale, Float[np.ndarray, " k"]]:
+    return unit_scale(problem), start_parameters(problem)
 
 
 def start_parameters(problem: Problem) -> Float[np.ndarray, " k"]:

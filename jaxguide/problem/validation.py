@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxguide.host.compilation import kept_quickly
 from jaxguide.problem.boundary import initial_entries, initial_values, initially_free, start_control
 from jaxguide.problem.parameters import with_parameters
 from jaxguide.problem.statement import Problem, is_free, start_value
@@ -18,13 +19,13 @@ from jaxguide.types import is_traced
 _ROUNDING = 1e-9
 
 
-@jax.jit
+@kept_quickly
 def _start(problem: Problem) -> tuple[Any, ...]:
     """Times, state, control and rate from which a search would start."""
     dtype = jnp.result_type(float)
     times = (problem.initial_time, problem.final_time)
     t0, tf = (jnp.asarray(start_value(t), dtype) for t in times)
-    x0, u0 = initial_values(problem, dtype), start_control(problem, dtype)
+    x0, u0 = jnp.asarray(initial_values(problem, dtype)), jnp.asarray(start_control(problem, dtype))
     return t0, tf, x0, u0, with_parameters(problem, None).dynamics(t0, x0, u0)
 
 
@@ -153,8 +154,11 @@ def validate(problem: Problem) -> None:
         return
     for name, size in sizes.items():
         _check_bounds(problem, name, size)
-    with jax.ensure_compile_time_eval():  # within a trace of something else, perhaps
-        t0, tf, x0, u0, rate = jax.device_get(_start(problem))
+    start = _start(problem)
+    if is_traced(start):  # within a trace of something else
+        with jax.ensure_compile_time_eval():
+            start = _start(problem)
+    t0, tf, x0, u0, rate = jax.device_get(start)
     _check_initial_values(problem, x0)
     _check_horizon(problem, float(t0), float(tf))
     if not np.all(np.isfinite(rate)) and not any(initially_free(problem)):

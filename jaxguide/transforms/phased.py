@@ -141,6 +141,15 @@ class Phased(Problem):
     def control_names(self) -> tuple[str, ...]:
         return self._named(lambda p: p.control_names)
 
+    # Without the names: they are long, and the numbers are asked for often.
+    @property
+    def n(self) -> int:
+        return sum(p.n for p in self.phases)
+
+    @property
+    def m(self) -> int:
+        return sum(p.m for p in self.phases)
+
     @property
     def initial_time(self) -> float:
         return 0.0

@@ -71,6 +71,9 @@ def newton_step(
     """The solution for one right-hand side, refined where it needs to be: stiff barriers lose
     digits in the reduced Hessian, but not in the product with the matrix."""
     add = lambda a, b: jax.tree_util.tree_map(xp.add, a, b)
+    # What must not move is held by forces that no step balances.
+    unheld = lambda given, force: xp.where(given, 0.0, force)
+    load = load._replace(force=jax.tree_util.tree_map(unheld, system.given, load.force))
     enough_force = _ENOUGH * xp.maximum(1.0, largest(load.force))
     enough_residual = _ENOUGH_RESIDUAL * largest(load.residual) + _LEAST_RESIDUAL
 
