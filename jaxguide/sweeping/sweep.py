@@ -1,6 +1,7 @@
 """`jg.sweep`: many dispersed flights and their statistics, in memory or into a store. Host only."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -231,9 +232,13 @@ def _programs(tiles: Tiles, asked: dict[str, Any]) -> dict[str, str]:
 
 
 def _compiled(tiles: Tiles) -> float:
-    """Compiles the program of a tile, and returns the seconds that it took."""
+    """Compiles the program of a tile, beside it that of the linear covariance, and returns the
+    seconds that it took."""
     began = time.perf_counter()
-    _ = tiles.bins  # flies a tile
+    with ThreadPoolExecutor(1) as beside:
+        linear = beside.submit(lambda: tiles.reference)
+        _ = tiles.bins  # flies a tile
+        linear.result()
     if tiles.order.cases >= _MANY:
         trim()
     return time.perf_counter() - began

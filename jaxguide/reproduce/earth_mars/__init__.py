@@ -3,6 +3,7 @@ the low-thrust Earth-Mars transfer, computed beside the paper's Table 2 and besi
 """
 
 import contextlib
+import importlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -51,6 +52,8 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
     with contextlib.closing(stages), pool() as beside, pool() as ahead:
         with stages("nominal"):
             compile_ahead(ahead, times, instants, SWEEP_CASES)
+            if out is not None:  # Matplotlib takes half a second
+                ahead.submit(importlib.import_module, f"{__name__}.figures")
             extremal = solve(EarthMars(), METHOD)
         with stages("gains"):
             grids, systems = wrong_sign_systems(extremal, instants)
