@@ -275,6 +275,8 @@ def _found(key: str, structure: Any, arrays: list[Any]) -> tuple[Any, Any] | Non
         if structure is None:
             structure = jax.tree_util.tree_structure(pickle.loads(packed))
         given = jax.tree_util.tree_structure(((arrays,), {}))
+        if b"lapack_" in program:
+            _lapack_found()
         with _without_noise():
             loaded = serialize_executable.deserialize_and_load(
                 program, given, structure, execution_devices=jax.devices()[:1]
@@ -283,6 +285,13 @@ def _found(key: str, structure: Any, arrays: list[Any]) -> tuple[Any, Any] | Non
     except Exception:  # unpickling and XLA's loader may raise anything
         cache.remove(key)
         return None
+
+
+@functools.cache
+def _lapack_found() -> None:
+    """Has JAX look up SciPy's LAPACK, as it does when it lowers a call of it: a program that was
+    loaded without a trace would call nothing, and crash."""
+    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
 
 
 def _key(*parts: str) -> str:

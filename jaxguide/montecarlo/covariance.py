@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
-from jaxguide.host.compilation import kept_quickly
+from jaxguide.host.compilation import kept_hastily
 from jaxguide.montecarlo.dispersions import Distribution
 from jaxguide.montecarlo.miss import end_errors
 from jaxguide.montecarlo.rollouts import draw, leaf_at, sorted_by_path, spread, with_deviations
@@ -34,7 +34,7 @@ def linear_covariance(
     return ends[:n], jnp.sum(parts, axis=0)[:n, :n]
 
 
-@kept_quickly
+@kept_hastily
 def linear_parts(
     mission: Mission, dispersions: dict[Any, Distribution], prepared: Prepared | None = None
 ) -> tuple[Float[Array, " k"], Float[Array, "part k k"], Float[Array, ""]]:

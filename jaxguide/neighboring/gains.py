@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxguide.bounds import positive, touches
-from jaxguide.host.compilation import kept_quickly
+from jaxguide.host.compilation import kept_hastily
 from jaxguide.neighboring.collocated import solve_horizons
 from jaxguide.neighboring.costate_gains import gains_at
 from jaxguide.neighboring.gain_map import GainMap, HorizonGains, SweptGains
@@ -17,7 +17,7 @@ from jaxguide.neighboring.linearization import refuse_integrals, terminal_condit
 from jaxguide.neighboring.segmented import NODES, SEGMENTS, SWEEPS, SweepPair, solve_sweeps
 from jaxguide.neighboring.sufficiency import conjugate_ahead
 from jaxguide.neighboring.sweep import GROUP
-from jaxguide.problem import is_free
+from jaxguide.problem import Problem, count, is_free
 from jaxguide.trajectory import Extremal, Point
 from jaxguide.types import RESULTS, is_traced, require_x64
 
@@ -118,7 +118,8 @@ def gain_schedule(
         known = np.asarray(extremal.t)
         _check_times(np.asarray(times), float(known[0]), float(known[-1]))
     sweep_nodes = NODES if nodes is None or method != "segmented" else nodes
-    schedule = _segmented(extremal, times, segments, sweep_nodes, sweeps, parameters, tolerance)
+    options = segments, sweep_nodes, sweeps, parameters, tolerance
+    schedule = _segmented(extremal, times, *options, _may_touch(extremal.problem))
     if method == "segmented":
         return schedule
     return _collocated(schedule, method, _PAPER_NODES if nodes is None else nodes, tolerance)
@@ -150,7 +151,7 @@ def _check_times(times: np.ndarray, t0: float, tf: float) -> None:
         )
 
 
-@kept_quickly
+@kept_hastily
 def _segmented(
     extremal: Extremal,
     times: Array,
@@ -159,6 +160,7 @@ def _segmented(
     sweeps: int,
     parameters: tuple[str, ...],
     tolerance: float,
+    bounded: bool,
 ) -> GainSchedule:
     problem = extremal.problem
     n, p = problem.n, len(parameters)
@@ -179,7 +181,9 @@ def _segmented(
         error=error,
         resolved=resolved,
         result=result,
-        bound_active=_bound_active(extremal, times, pair.state, pair.control),
+        bound_active=_bound_active(extremal, times, pair.state, pair.control)
+        if bounded
+        else jnp.zeros(times.shape, bool),
         K_parameters=gains.K[0, :, :, n : n + p],
         K_target=gains.K[0, :, :, n + p :],
         dtf_dx=gains.time[0, :, :n],
@@ -218,6 +222,17 @@ def _judged(
 _ON_BOUND = 1e-6
 
 
+def _may_touch(problem: Problem) -> bool:
+    """Whether there is a bound that the extremal could touch; also where that is not to be seen.
+
+    Sizes along the extremal, which tell, would be a fifth of the program.
+    """
+    bounds = problem.state_bounds, problem.control_bounds
+    if is_traced(bounds) or count(problem, "path_constraints"):
+        return True
+    return not all(np.all(np.isinf(np.asarray(side))) for pair in bounds for side in pair)
+
+
 def _bound_active(
     extremal: Extremal, times: Array, x: Float[Array, "time n"], u: Float[Array, "time m"]
 ) -> Bool[Array, " time"]:
@@ -232,7 +247,7 @@ def _bound_active(
     )
 
 
-@kept_quickly
+@kept_hastily
 def _collocated(exact: GainSchedule, method: str, nodes: int, tolerance: float) -> GainSchedule:
     """As `exact`, with the gains of the paper's own equations; their error is the difference."""
     extremal, times = exact.extremal, exact.times

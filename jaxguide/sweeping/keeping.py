@@ -1,9 +1,26 @@
 """Where a sweep keeps its chunks: the calls that files and memory both serve. Host only."""
 
 import abc
+import contextlib
+import sys
+import threading
 from typing import Any
 
 import numpy as np
+
+
+def import_beside() -> None:
+    """Imports xarray, and all that it imports at its first Dataset, in a thread of its own: half a
+    second or more, which passes while XLA compiles. Whoever imports it meanwhile waits."""
+
+    def imported() -> None:
+        with contextlib.suppress(Exception):  # whoever needs it says so better
+            import xarray as xr
+
+            xr.Dataset({"none": ("case", np.zeros(1))})
+
+    if "xarray" not in sys.modules:
+        threading.Thread(target=imported, daemon=True).start()
 
 
 class AbstractStore(abc.ABC):

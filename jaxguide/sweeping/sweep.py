@@ -19,7 +19,7 @@ from jaxguide.sweeping import importance, ranking
 from jaxguide.sweeping.chunks import Flights, SweepPlan, fly_chunks, tally_of
 from jaxguide.sweeping.histories import cases_in_full, in_full, program_in_full
 from jaxguide.sweeping.identity import about, manifest
-from jaxguide.sweeping.keeping import AbstractStore, Memory
+from jaxguide.sweeping.keeping import AbstractStore, Memory, import_beside
 from jaxguide.sweeping.stopping import Stop, fitting
 from jaxguide.sweeping.store import EARLIER, Store, differences, made_earlier
 from jaxguide.sweeping.tiles import TILE, Order, Tiles
@@ -111,6 +111,7 @@ def sweep(
     _check_arguments(cases, tile, chunk, keep, resume, store, sampling, stop, histories, failures)
     mission = mission if dtype is None else cast(mission, dtype)
     _check_dispersions(mission, dispersions, sampling)
+    import_beside()
     if cases >= _MANY:
         trim()
     order = Order(mission, dispersions, seed, cases, tile, sampling)

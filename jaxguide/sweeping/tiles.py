@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Prepared, simulate
-from jaxguide.host.compilation import kept_quickly
+from jaxguide.host.compilation import kept_hastily, kept_quickly
 from jaxguide.host.executables import kept
 from jaxguide.montecarlo.covariance import entry_names, linear_parts, part_names
 from jaxguide.montecarlo.dispersions import Distribution
@@ -61,6 +61,7 @@ class Tiles:
         self.order = order
         self.devices = devices or jax.local_devices()
         self.count = -(-order.cases // order.tile)
+        self._first: dict[str, np.ndarray] | None = None
         mission, dispersions = order.mission, order.dispersions
         self._prepared = prepared_of(order)
         paths = [path for group, _ in sorted_by_path(dispersions) for path in group]
@@ -126,7 +127,7 @@ class Tiles:
 
         The linear covariance gives no size where a law cancels all first-order effects.
         """
-        rows = self._whole(0)
+        rows = self._first = self._whole(0)
         good = rows["result"] == code(RESULTS.successful)
         size = self._deviations(rows)[good].std(axis=0) if good.any() else np.ones(len(self.names))
         return importance.edges_of(self._draws(rows)), np.where(size > 0, size, 1.0)
@@ -184,7 +185,11 @@ class Tiles:
     def fly(self, index: int) -> dict[str, np.ndarray]:
         """Name -> values (case, ...) of tile `index`, without lanes beyond the last case."""
         live = min(self.order.tile, self.order.cases - index * self.order.tile)
-        return {name: values[:live] for name, values in self._whole(index).items()}
+        rows = None
+        if index == 0:  # flown for its bins
+            rows, self._first = self._first, None
+        rows = self._whole(index) if rows is None else rows
+        return {name: values[:live] for name, values in rows.items()}
 
     def _draws(self, rows: dict[str, np.ndarray]) -> np.ndarray:
         """(cases, d): every drawn number, in the order of `drawn_names`."""
@@ -267,7 +272,7 @@ def compiler_options() -> dict[str, Any]:
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
 
 
-_prepare = kept_quickly(shared)
+_prepare = kept_hastily(shared)
 _points = kept_quickly(points)
 
 

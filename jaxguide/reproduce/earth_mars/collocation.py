@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial.legendre import legval, legvander
 
-from jaxguide.host.compilation import kept_quickly
+from jaxguide.host.compilation import kept_hastily
 from jaxguide.neighboring.breaks import place_breaks
 from jaxguide.neighboring.linearization import LinearTPBVP, linearize
 from jaxguide.neighboring.sweep import collocate
@@ -75,7 +75,7 @@ def linearized_at(
     return points, HamiltonianSystem(M, U, psi)
 
 
-@kept_quickly
+@kept_hastily
 def _at(extremal: Extremal, t: Any) -> tuple[Point, LinearTPBVP]:
     return extremal(t), linearize(extremal, t)
 
@@ -176,10 +176,10 @@ def segmented_gains(extremal: Extremal, tau: float) -> dict[int, np.ndarray]:
     return found
 
 
-_breaks = kept_quickly(place_breaks)
+_breaks = kept_hastily(place_breaks)
 
 
-@kept_quickly
+@kept_hastily
 def _across(M: Array, widths: Array) -> Float[Array, "size row column segment"]:
     # 12 sweeps: more than the 10 with which bench/gains.py reaches 1e-12.
     return jax.vmap(lambda M, w: collocate(M, w, None, 12)[1])(M, widths)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxguide.flight.integrators import RungeKutta4
 from jaxguide.flight.mission import Mission
 from jaxguide.flight.simulate import Flight, Prepared, simulate
-from jaxguide.host.compilation import kept_quickly
+from jaxguide.host.compilation import kept_hastily, kept_quickly
 from jaxguide.laws.holds import History
 from jaxguide.laws.lanes import SampleGrid
 from jaxguide.laws.neighboring import NeighboringOptimal, PreparedNeighboring
@@ -96,7 +96,7 @@ def fly_variants(
     return {name: pick(k) for k, name in enumerate(variants)}
 
 
-@kept_quickly
+@kept_hastily
 def _fly(mission: Mission, prepared: Prepared, deviations: Array) -> Flight:
     """Every variant with every deviation, in one `vmap`: two, nested, trace twice as much."""
 
