@@ -178,10 +178,9 @@ e = jg.solve(Spring(), jg.Pseudospectral(segments=4, refinements=0))
 lowered = [name for name in compiled if "point_" in name]
 # LAPACK is looked up when a program that calls it is lowered, or else when it is loaded.
 from jaxguide.host.executables import kept
-matrix = 4 * jnp.eye(3)
-factor = kept(jax.lax.linalg.cholesky)(matrix)
-lowered += [name for name in compiled if "cholesky" in name]
-assert (factor == 2 * jnp.eye(3)).all() and (kept(jnp.linalg.eigvalsh)(matrix) == 4).all()
+values = kept(jnp.linalg.eigvalsh)(4 * jnp.eye(3))
+lowered += [name for name in compiled if "eigvalsh" in name]
+assert (values == 4).all()
 print(json.dumps({"J": float(e.objective), "lowered": lowered, "name": type(e.problem).__name__}))
 """
 
