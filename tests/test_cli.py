@@ -74,7 +74,7 @@ def sweep(mission, dispersions, cases, seed, *, store, scheduler, dtype, progres
 
 @pytest.fixture(autouse=True)
 def stand_ins(monkeypatch):
-    monkeypatch.setattr(cli, "configure", lambda: None)  # leaves the suite's own settings alone
+    monkeypatch.setattr(cli, "configure", lambda kept: None)  # the suite has settings of its own
     monkeypatch.setattr(doctor, "canary", lambda: 0)
     fakes = {
         jaxguide: {

@@ -263,7 +263,7 @@ def test_report_in_a_browser(store, tmp_path):
 @pytest.mark.slow
 def test_the_store_is_read_by_the_command_line(mission, tmp_path, monkeypatch, capfd):
     """rerun by the store's own dispersions; refused where the mission has changed since."""
-    monkeypatch.setattr(cli, "configure", lambda: None)
+    monkeypatch.setattr(cli, "configure", lambda kept: None)
     (tmp_path / "d.toml").write_text(TOML)
     spread = jg.dispersions_from(tmp_path / "d.toml")
     path = str(tmp_path / "a.zarr")

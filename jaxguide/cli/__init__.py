@@ -46,7 +46,7 @@ def run(argv: list[str]) -> int:
         return 0
     if "jax" not in sys.modules:
         sweeping.options_of_xla(command, bound.arguments)
-    configure()
+    configure(_keeps_all(command, bound.arguments))
     stdout = sys.stdout
     try:
         # With --json nothing else may reach stdout, not even a library's print.
@@ -73,10 +73,20 @@ def run(argv: list[str]) -> int:
     return 0 if outcome.ok else 1
 
 
-def configure() -> None:
+def _keeps_all(command: Any, arguments: dict[str, Any]) -> bool:
+    """Whether the package itself keeps the programs of the command: all that take long."""
+    if command is solving.reproduce:
+        return arguments["name"] == "earth-mars"
+    return command is not tuning.tune
+
+
+def configure(kept: bool = False) -> None:
     """float64, and a compilation cache that lasts, for this process.
 
     Called before JAX and Equinox are imported: both read the environment when imported.
+
+    **Arguments:** `kept`: whether the package's own cache (`jaxguide.host.executables`), which
+    finds a program without tracing it, is enough.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # cache hits on CPU are noisy
     # Source lines in compiled programs serve debuggers and take a tenth of a short run.
@@ -90,7 +100,8 @@ def configure() -> None:
 
     jax.config.update("jax_enable_x64", True)
     # JAX's own cache holds every program, those of tuning too; the package's then stands aside.
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+    given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if given is None and not (kept and cache.folder()):
         jax.config.update("jax_compilation_cache_dir", str(cache.folder_of_jax()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 

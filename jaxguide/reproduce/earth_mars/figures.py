@@ -94,13 +94,13 @@ def overview(extremal: Extremal, schedule: GainSchedule, dataset: Any) -> Figure
     gains.legend(loc="upper left")
 
     good = np.asarray(dataset["result"]) == 0
-    final = np.asarray(dataset["final_state"])[good] - np.asarray(extremal.x[-1])
-    start = (np.asarray(dataset["initial_state"])[good] - np.asarray(extremal.x[0]))[:, 0]
+    final = np.asarray(dataset["final_state"])[good] - np.asarray(extremal.x)[-1]
+    start = (np.asarray(dataset["initial_state"])[good] - np.asarray(extremal.x)[0])[:, 0]
     bins = np.linspace(-0.012, 0.012, 61)  # by eye: all ends but a few, 0.4e-3 a bin
     circular = (
         final[:, 2]
-        + np.sqrt(1 / float(extremal.x[-1, 0]))
-        - np.sqrt(1 / (float(extremal.x[-1, 0]) + final[:, 0]))
+        + np.sqrt(1 / float(np.asarray(extremal.x)[-1, 0]))
+        - np.sqrt(1 / (float(np.asarray(extremal.x)[-1, 0]) + final[:, 0]))
     )
     for k, (values, text) in enumerate(
         ((start, "start: $\\delta r(0)$"), (final[:, 0], "end: $\\delta r(t_f)$"),

@@ -33,7 +33,8 @@ INTEGRATOR = RungeKutta4(16)
 
 def reoptimise(case: tuple[float, ...]) -> Extremal:
     """The extremal from the nominal start plus `case` (LU, LU/TU), solved without a guess."""
-    start = tuple(a + b for a, b in zip(EarthMars.initial_state, case, strict=True))
+    # Arrays, so that the programs take them: as numbers they would be a part of each.
+    start = tuple(np.float64(a + b) for a, b in zip(EarthMars.initial_state, case, strict=True))
     return solve(dataclasses.replace(EarthMars(), initial_state=start), METHOD)
 
 
@@ -114,4 +115,4 @@ def _fly(mission: Mission, prepared: Prepared, deviations: Array) -> Flight:
 
 def final_errors(flight: Flight, reoptimised: list[Extremal]) -> np.ndarray:
     """Flown minus re-optimised final state, shape (case, n), in LU and LU/TU."""
-    return np.asarray(flight.final_state) - np.stack([np.asarray(e.x[-1]) for e in reoptimised])
+    return np.asarray(flight.final_state) - np.stack([np.asarray(e.x)[-1] for e in reoptimised])

@@ -35,9 +35,10 @@ def nominal(report: Report, extremal: Extremal) -> None:
         "without numbers. H is minimised here, so the "
         "costates are minus those of a maximised H.",
     )
-    section.add("r(tf)", extremal.x[-1, 0], RADIUS, tolerance=1e-10, unit="LU")
+    x, costate = np.asarray(extremal.x), np.asarray(extremal.costate)
+    section.add("r(tf)", x[-1, 0], RADIUS, tolerance=1e-10, unit="LU")
     for where, k, reference in (("0", 0, COSTATE_START), ("tf", -1, COSTATE_END)):
-        for name, value, wanted in zip(STATES, extremal.costate[k], reference, strict=True):
+        for name, value, wanted in zip(STATES, costate[k], reference, strict=True):
             section.add(f"costate of {name} at {where}", value, wanted, tolerance=1e-10)
     angles = linearized_at(extremal, np.asarray(list(ANGLES)))[0].u[:, 0]
     turns = 2 * np.pi * np.round((angles[0] - ANGLES[0.0]) / (2 * np.pi))
@@ -114,7 +115,7 @@ def table_2(report: Report, flights: dict[str, Flight], reoptimised: list[Extrem
         "Re-optimised",
         "Each case solved again from its perturbed start, without a guess.",
     )
-    finals = np.stack([np.asarray(e.x[-1]) for e in reoptimised])
+    finals = np.stack([np.asarray(e.x)[-1] for e in reoptimised])
     for i in range(len(CASES)):
         off = np.max(np.abs(finals[i] - REOPTIMISED[i]))
         section.add(f"case {i + 1}: error of x(tf)", off, 0, tolerance=1e-10)
