@@ -10,7 +10,7 @@ import numpy as np
 from jaxguide.host.compilation import kept_quickly
 from jaxguide.problem.boundary import initial_entries, initial_values, initially_free, start_control
 from jaxguide.problem.parameters import with_parameters
-from jaxguide.problem.statement import Problem, is_free, start_value
+from jaxguide.problem.statement import Problem, is_free, start_value, with_typed_leaves
 from jaxguide.types import is_traced
 
 # How far an initial state may lie outside the state bounds, relative to 1 + |x0|: the rounding of
@@ -155,10 +155,11 @@ def validate(problem: Problem) -> None:
         return
     for name, size in sizes.items():
         _check_bounds(problem, name, size)
-    start = _start(problem)
+    typed = with_typed_leaves(problem)
+    start = _start(typed)
     if is_traced(start):  # within a trace of something else
         with jax.ensure_compile_time_eval():
-            start = _start(problem)
+            start = _start(typed)
     t0, tf, x0, u0, rate = jax.device_get(start)
     _check_initial_values(problem, x0)
     _check_horizon(problem, float(t0), float(tf))
