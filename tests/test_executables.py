@@ -71,11 +71,22 @@ print(json.dumps({"compiled": len(mine), "out": [np.asarray(a).tolist() for a in
 """
 
 
-def in_a_process(folder, **environment):
-    """What PROGRAM printed, and its stderr."""
+# A program of the package that calls LAPACK (QR, for gains by least squares), told without a trace.
+WITH_LAPACK = """
+import json, jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from jaxguide.host.executables import kept
+program, arguments = kept(jax.numpy.linalg.qr), (np.eye(3) + 1.0,)
+known = program.is_kept(*arguments)
+print(json.dumps({"known": known, "out": np.asarray(program(*arguments)[1]).tolist()}))
+"""
+
+
+def in_a_process(folder, program=PROGRAM, **environment):
+    """What `program` printed, and its stderr."""
     given = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", "TF_CPP"))}
     given |= {cache.VARIABLE: str(folder), **environment}
-    command = [sys.executable, "-c", PROGRAM]
+    command = [sys.executable, "-c", program]
     done = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
     return json.loads(done.stdout), done.stderr
 
@@ -96,6 +107,12 @@ def test_second_process_compiles_nothing(tmp_path):
     # JAX's own cache is left alone, and is left to work alone.
     own = in_a_process(tmp_path / "other", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "jax"))[0]
     assert own["compiled"] == 1 and not (tmp_path / "other").exists()
+
+
+def test_lapack_is_there_for_a_program_that_was_not_traced(tmp_path):
+    first, second = (in_a_process(tmp_path / "programs", WITH_LAPACK)[0] for _ in range(2))
+    assert (first["known"], second["known"]) == (False, True)
+    assert first["out"] == second["out"]
 
 
 def test_kept_again(folder, compilations):

@@ -120,6 +120,14 @@ class Kept:
             return self._jitted(*args, **kwargs)
         return eqx.combine(moved, still.value)
 
+    def is_kept(self, *args: Any, **kwargs: Any) -> bool:
+        """Whether an earlier process kept the program for these arguments, told without a trace."""
+        given = _given(args, kwargs)
+        if given is None or _stands_aside(given[0]):
+            return False
+        known = _told_key(self, (args, kwargs))
+        return known is not None and cache.read(known) is not None
+
     def lower(self, *args: Any, **kwargs: Any) -> jax.stages.Lowered:
         """The program for these arguments, lowered; a call finds it traced."""
         given = _given(args, kwargs)

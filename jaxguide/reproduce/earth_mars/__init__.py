@@ -13,6 +13,7 @@ from jaxguide.neighboring.gains import gain_schedule
 from jaxguide.problems import earth_mars
 from jaxguide.problems.earth_mars import SAMPLE_INTERVAL, EarthMars
 from jaxguide.reproduce.earth_mars import sections
+from jaxguide.reproduce.earth_mars.ahead import compile_ahead
 from jaxguide.reproduce.earth_mars.collocation import (
     relative_gain_errors,
     wrong_sign_histories,
@@ -44,11 +45,13 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
     """
     report = Report("Earth-Mars transfer: neighbouring optimal control (Yan, Fahroo & Ross 2002)")
     stages = Stages(report, NoProgress() if progress is None else progress, 4 + (out is not None))
-    with contextlib.closing(stages), ThreadPoolExecutor(1) as beside:
+    times = np.arange(round(EarthMars.final_time / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
+    instants = stage_times(times)
+    pool = lambda: ThreadPoolExecutor(1)
+    with contextlib.closing(stages), pool() as beside, pool() as ahead:
         with stages("nominal"):
+            compile_ahead(ahead, times, instants, SWEEP_CASES)
             extremal = solve(EarthMars(), METHOD)
-        times = np.arange(round(float(extremal.final_time) / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
-        instants = stage_times(times)
         with stages("gains"):
             grids, systems = wrong_sign_systems(extremal, instants)
             wrong = beside.submit(wrong_sign_histories, grids, systems, instants)
