@@ -3,6 +3,7 @@ digest does not show would run an old program, so each kind of change is made he
 
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false, reportArgumentType=false
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -13,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 
+import jaxguide as jg
 from jaxguide.host import cache, fingerprint
 from jaxguide.host.fingerprint import Untold, told
 
@@ -146,6 +148,17 @@ def test_a_known_rule_of_differentiation_is_told():
     assert digest(MODULE.replace("1.5 * v", "jg.sincos(v)[0]")) != digest(MODULE)
 
 
+def test_all_that_a_problem_offers_is_told():
+    """What the package may ask of a Problem must decide its programs."""
+    from jaxguide.problem import told as of_problems
+
+    elsewhere = {"optimal_control", "parameter_paths", "check_statement"}  # the last: host alone
+    known = {*of_problems._DATA, *of_problems._ALONG, *of_problems._AT_ENDS, *elsewhere}
+    assert {name for name in dir(jg.Problem) if not name.startswith("_")} <= known
+    fields = {field.name for field in dataclasses.fields(jg.Problem)}
+    assert fields <= known
+
+
 def test_the_package_is_in_the_key(monkeypatch):
     code = fingerprint.known_code()
     fingerprint.known_code.cache_clear()
@@ -176,6 +189,11 @@ def listen(event, duration, **kwargs):
 jax.monitoring.register_event_duration_secs_listener(listen)
 e = jg.solve(Spring(), jg.Pseudospectral(segments=4, refinements=0))
 lowered = [name for name in compiled if "point_" in name]
+# LAPACK is looked up when a program that calls it is lowered, or else when it is loaded.
+from jaxguide.host.executables import kept
+values = kept(jnp.linalg.eigvalsh)(4 * jnp.eye(3))
+lowered += [name for name in compiled if "eigvalsh" in name]
+assert (values == 4).all()
 print(json.dumps({"J": float(e.objective), "lowered": lowered, "name": type(e.problem).__name__}))
 """
 

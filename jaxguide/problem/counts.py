@@ -13,12 +13,12 @@ from jaxguide.problem.statement import Problem
 
 def count(problem: Problem, name: str) -> int:
     """Number of components of `name`: "path_constraints" or "integrands"."""
-    return _size(*_kind(problem), name)
+    return _sizes(*_kind(problem))[name]
 
 
 def endpoint_count(problem: Problem) -> int:
     """Number of endpoint constraints."""
-    return _size(*_kind(problem), "endpoint_constraints")
+    return _sizes(*_kind(problem))["endpoint_constraints"]
 
 
 @remembered
@@ -28,15 +28,20 @@ def _kind(problem: Problem) -> tuple[Any, tuple[Any, ...]]:
 
 
 @functools.lru_cache(4096)  # a trace takes a millisecond, and every mesh asks ten times
-def _size(structure: Any, types: tuple[Any, ...], name: str) -> int:
-    """The number of components that the function `name` has in problems of one kind."""
+def _sizes(structure: Any, types: tuple[Any, ...]) -> dict[str, int]:
+    """The numbers of components that the constraints have in problems of one kind."""
     dtype = jnp.result_type(float)
     number = lambda *shape: jax.ShapeDtypeStruct(shape, dtype)
 
     def values(problem: Problem, t: Any, x: Any, u: Any) -> Any:
-        function = getattr(with_parameters(problem, None), name)
-        return function(x, x, t, t) if name == "endpoint_constraints" else function(t, x, u)
+        stated = with_parameters(problem, None)
+        return {
+            "path_constraints": stated.path_constraints(t, x, u),
+            "integrands": stated.integrands(t, x, u),
+            "endpoint_constraints": stated.endpoint_constraints(x, x, t, t),
+        }
 
     like = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types]
     problem = structure.unflatten(like)
-    return jax.eval_shape(values, problem, number(), number(problem.n), number(problem.m)).shape[0]
+    found = jax.eval_shape(values, problem, number(), number(problem.n), number(problem.m))
+    return {name: value.shape[0] for name, value in found.items()}

@@ -10,7 +10,7 @@ import numpy as np
 from jaxguide.host.compilation import kept_quickly
 from jaxguide.problem.boundary import initial_entries, initial_values, initially_free, start_control
 from jaxguide.problem.parameters import with_parameters
-from jaxguide.problem.statement import Problem, is_free, start_value
+from jaxguide.problem.statement import Problem, is_free, start_value, with_typed_leaves
 from jaxguide.types import is_traced
 
 # How far an initial state may lie outside the state bounds, relative to 1 + |x0|: the rounding of
@@ -29,31 +29,32 @@ def _start(problem: Problem) -> tuple[Any, ...]:
     return t0, tf, x0, u0, with_parameters(problem, None).dynamics(t0, x0, u0)
 
 
-def _shape(problem: Problem, name: str, wanted: tuple[int, ...] | None, *args: Any) -> tuple:
-    """The shape that the function `name` returns, refused unless `wanted` (None: a vector)."""
+def _shape(stated: Problem, name: str, wanted: tuple[int, ...] | None, *args: Any) -> tuple:
+    """The shape that the function `name` of a Problem with numbers for its parameters returns,
+    refused unless `wanted` (None: a vector)."""
     try:
-        out = jax.eval_shape(getattr(with_parameters(problem, None), name), *args)
+        out = jax.eval_shape(getattr(stated, name), *args)
     except Exception as e:
-        kind, unnamed = type(problem).__name__, ""
-        if not problem.m:
+        kind, unnamed = type(stated).__name__, ""
+        if not stated.m:
             unnamed = (
                 f" {kind}.control_names is (), so there is no control; if there is one, name it "
                 "there, in a tuple of strings."
             )
         raise ValueError(
-            f"{kind}.{name} could not be evaluated with a state of {problem.n} and a control of "
-            f"{problem.m} components: {e}\nIndex and stack by these sizes, with jax.numpy.{unnamed}"
+            f"{kind}.{name} could not be evaluated with a state of {stated.n} and a control of "
+            f"{stated.m} components: {e}\nIndex and stack by these sizes, with jax.numpy.{unnamed}"
         ) from e
     shape = getattr(out, "shape", None)
     if wanted is not None and shape != wanted:
         entry = "control" if name == "optimal_control" else "state"
         raise ValueError(
-            f"{type(problem).__name__}.{name} returned shape {shape}, expected {wanted}. "
+            f"{type(stated).__name__}.{name} returned shape {shape}, expected {wanted}. "
             + ("Return a scalar." if wanted == () else f"Stack one entry per {entry}.")
         )
     if wanted is None and (shape is None or len(shape) != 1):
         raise ValueError(
-            f"{type(problem).__name__}.{name} returned shape {shape}; return a vector (jnp.stack)."
+            f"{type(stated).__name__}.{name} returned shape {shape}; return a vector (jnp.stack)."
         )
     return shape  # pyright: ignore[reportReturnType]
 
@@ -154,10 +155,11 @@ def validate(problem: Problem) -> None:
         return
     for name, size in sizes.items():
         _check_bounds(problem, name, size)
-    start = _start(problem)
+    typed = with_typed_leaves(problem)
+    start = _start(typed)
     if is_traced(start):  # within a trace of something else
         with jax.ensure_compile_time_eval():
-            start = _start(problem)
+            start = _start(typed)
     t0, tf, x0, u0, rate = jax.device_get(start)
     _check_initial_values(problem, x0)
     _check_horizon(problem, float(t0), float(tf))
@@ -175,18 +177,19 @@ def _check_shapes(problem: Problem) -> dict[str, int]:
     n, m, dtype = problem.n, problem.m, jnp.result_type(float)
     t = jax.ShapeDtypeStruct((), dtype)
     x, u = jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype)
-    _shape(problem, "dynamics", (n,), t, x, u)
-    _shape(problem, "running_cost", (), t, x, u)
-    _shape(problem, "endpoint_cost", (), x, x, t, t)
+    stated = with_parameters(problem, None)
+    _shape(stated, "dynamics", (n,), t, x, u)
+    _shape(stated, "running_cost", (), t, x, u)
+    _shape(stated, "endpoint_cost", (), x, x, t, t)
     sizes = {
         "state_bounds": n,
         "control_bounds": m,
-        "endpoint_bounds": _shape(problem, "endpoint_constraints", None, x, x, t, t)[0],
-        "path_bounds": _shape(problem, "path_constraints", None, t, x, u)[0],
-        "integral_bounds": _shape(problem, "integrands", None, t, x, u)[0],
+        "endpoint_bounds": _shape(stated, "endpoint_constraints", None, x, x, t, t)[0],
+        "path_bounds": _shape(stated, "path_constraints", None, t, x, u)[0],
+        "integral_bounds": _shape(stated, "integrands", None, t, x, u)[0],
     }
     if problem.has_closed_form:
-        _shape(problem, "optimal_control", (m,), t, x, x)
+        _shape(stated, "optimal_control", (m,), t, x, x)
     return sizes
 
 
