@@ -376,19 +376,22 @@ def _minimised(
     quick: bool,
 ) -> interior_point.Solution:
     """`interior_point.minimise` by NumPy, and compiled from the iteration on at which that is worth
-    it: the first if `quick` is False."""
+    it: the first if `quick` is False, or if an earlier process kept the program."""
+    began, further = time.perf_counter(), compiled(interior_point.iterated, quick)
     leaves, structure = jax.tree_util.tree_flatten((program, start))
     size = (structure, *map(np.shape, leaves))
-    spent, began = _on_host_so_far.get(size, 0.0), time.perf_counter()
-    more = _MORE * (program.counts.n + program.counts.m)
-    least = _WORTH_COMPILING + more if quick else 0.0
-    further = lambda: spent + time.perf_counter() - began < least
     state = interior_point.begun(program, limits, start, options)
-    state = interior_point.iterated(program, limits, options, state, further)
+    on_device = lambda state: jax.device_put((program, limits, options, state))
+    if size not in _on_host_so_far:
+        known = further.is_kept(*on_device(state))
+        _on_host_so_far[size] = np.inf if known else 0.0
+    spent, more = _on_host_so_far[size], _MORE * (program.counts.n + program.counts.m)
+    least = _WORTH_COMPILING + more if quick else 0.0
+    here = lambda: spent + time.perf_counter() - began < least
+    state = interior_point.iterated(program, limits, options, state, here)
     _on_host_so_far[size] = spent + time.perf_counter() - began
     if state.status == interior_point.RUNNING:
-        given = jax.device_put((program, limits, options, state))
-        state = jax.device_get(compiled(interior_point.iterated, quick)(*given))
+        state = jax.device_get(further(*on_device(state)))
     return interior_point.ended(program, state)
 
 

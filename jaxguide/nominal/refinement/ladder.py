@@ -14,7 +14,9 @@ from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 from jaxguide.types import succeeded
 
-_COARSE = 3  # segments of the mesh that is tried where the first one fails
+# Segments of the mesh that is tried where the first one fails, and its most iterations: one that
+# needs more leads nowhere. Chosen, not tuned.
+_COARSE, _FEW = 3, 200
 # How far dynamics may be missed where that one fails, in states per horizon: first choices.
 _LOOSENED = (1.0, 0.3, 0.1, 0.03)
 
@@ -45,7 +47,7 @@ def _up_the_ladder(method: Any, problem: Problem, best: Extremal) -> Extremal:
     """A coarse grid first (review, section 4.4), for fewer nodes ask less of a guess; then random
     starts; then dynamics that may be missed by a delta that shrinks to nothing (review, Theorem 2).
     `best` where all fail."""
-    coarse = dataclasses.replace(method, segments=_COARSE) if _may_be_coarse(method) else None
+    coarse = _coarse(method)
     if coarse is not None:
         below = run_on_host(coarse, problem, None)
         if succeeded(below.result):
@@ -78,7 +80,10 @@ def _loosened(method: Any, coarse: Any, problem: Problem, best: Extremal) -> Ext
     return found if succeeded(found.result) else best
 
 
-def _may_be_coarse(method: Any) -> bool:
-    """Whether it has a mesh that may be a coarser one."""
-    stated = method.fractions is not None or method.knots or method.arcwise is not None
-    return not stated and method.segments > _COARSE
+def _coarse(method: Any) -> Any:
+    """The method on a coarse grid; None where its mesh is given, or is as coarse."""
+    if method.fractions is not None or method.knots or method.arcwise is not None:
+        return None
+    few = min(method.max_iterations, _FEW)
+    coarse = dataclasses.replace(method, segments=_COARSE, max_iterations=few)
+    return coarse if method.segments > _COARSE else None
