@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxguide.host.lapack import one_thread
 from jaxguide.host.progress import NoProgress, Progress
 from jaxguide.neighboring.gains import gain_schedule
 from jaxguide.problems import earth_mars
@@ -49,7 +50,7 @@ def run(out: Path | None = None, progress: Progress | None = None) -> Report:
     times = np.arange(round(EarthMars.final_time / SAMPLE_INTERVAL)) * SAMPLE_INTERVAL
     instants = stage_times(times)
     pool = lambda: ThreadPoolExecutor(1)
-    with contextlib.closing(stages), pool() as beside, pool() as ahead:
+    with contextlib.closing(stages), one_thread(), pool() as beside, pool() as ahead:
         with stages("nominal"):
             compile_ahead(ahead, times, instants, SWEEP_CASES)
             if out is not None:  # Matplotlib takes half a second

@@ -53,8 +53,8 @@ def _stand_in(like: Any) -> Extremal:
 
 def _run(extremal: Extremal, times: np.ndarray, instants: np.ndarray, cases: int) -> None:
     schedule = gain_schedule(extremal, times)
+    of_exact = histories(schedule, instants)
     mission = earth_mars.mission(extremal)
     tiles = Tiles(Order(mission, earth_mars.dispersions(), 0, cases, TILE))
     _ = tiles.bins, tiles.reference
-    of_exact = histories(schedule, instants)
     fly_variants(schedule, instants, of_exact, of_exact, np.asarray(of_exact))
