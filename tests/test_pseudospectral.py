@@ -183,7 +183,7 @@ def test_state_constraint_has_a_multiplier_of_the_right_sign():
     np.testing.assert_allclose(e.costate[0, 0] - e.costate[-1, 0], 36, rtol=1e-3)
 
 
-@pytest.mark.slow  # four programs
+@pytest.mark.slow  # a program of half a minute
 def test_earth_mars_against_shooting(earth_mars):
     method = jg.Pseudospectral(nodes=12, segments=6, refinements=0)
     e = jg.solve(EarthMars(), method)
@@ -193,15 +193,11 @@ def test_earth_mars_against_shooting(earth_mars):
     assert off.max() < 1e-5
     again = jg.solve(EarthMars(), method, guess=earth_mars)
     np.testing.assert_allclose(again.objective, e.objective, rtol=1e-9)
-    lanes = jax.jit(
-        jax.vmap(lambda k: jg.solve(dataclasses.replace(EarthMars(), thrust=k), method).objective)
-    )(jnp.array([0.1405, 0.141]))
+    objective = lambda k: jg.solve(dataclasses.replace(EarthMars(), thrust=k), method).objective
+    lanes, slopes = jax.jit(jax.vmap(jax.value_and_grad(objective)))(jnp.array([0.1405, 0.141]))
     np.testing.assert_allclose(lanes[0], e.objective, rtol=1e-9)
-    slope = jax.jit(
-        jax.grad(lambda k: jg.solve(dataclasses.replace(EarthMars(), thrust=k), method).objective)
-    )(0.1405)
     # reference/earth_mars.json; the mesh leaves 1e-8 of it.
-    np.testing.assert_allclose(slope, -3.5434202430, rtol=1e-7)
+    np.testing.assert_allclose(slopes[0], -3.5434202430, rtol=1e-7)
 
 
 @pytest.mark.slow
@@ -241,7 +237,7 @@ def test_degenerate_bounds_are_flagged():
     assert flags == [False, True, False]
 
 
-@pytest.mark.slow  # two programs of half a minute; test_bounds.py has each kind of bound once
+@pytest.mark.slow  # a program of half a minute; test_bounds.py has each kind of bound once
 def test_implicit_derivatives_with_an_active_bound():
     """d tf of a bang-bang landing by gravity, the thrust limit and the initial height, both ways,
     against finite differences of solutions on the same mesh."""
@@ -251,16 +247,21 @@ def test_implicit_derivatives_with_an_active_bound():
             problems.get("moon-lander"), gravity=gravity, control_bounds=(0.0, limit),
             initial_state=(height, -2.0),
         )  # fmt: skip
-        method = jg.Pseudospectral(nodes=4, segments=6, tolerance=1e-11)
+        method = jg.Pseudospectral(nodes=4, segments=6, refinements=0, tolerance=1e-11)
         return jg.solve(problem, method, throw=False).final_time
 
     at, h = (1.5, 3.0, 10.0), 1e-5
-    solved = jax.jit(landing)
-    forward = jax.jit(jax.jacfwd(landing, argnums=(0, 1, 2)))(*at)
-    backward = jax.jit(jax.grad(landing, argnums=(0, 1, 2)))(*at)
+
+    @jax.jit
+    def both(*at):
+        _, push = jax.linearize(landing, *at)  # one solve for both ways
+        pull = jax.linear_transpose(push, *at)
+        return jax.vmap(push)(*jnp.eye(3)), pull(jnp.ones(()))
+
+    forward, backward = both(*map(jnp.asarray, at))
     for i in range(3):
         shift = lambda d, i=i: [a + d * (j == i) for j, a in enumerate(at)]
-        slope = (solved(*shift(h)) - solved(*shift(-h))) / (2 * h)
+        slope = (landing(*shift(h)) - landing(*shift(-h))) / (2 * h)
         # Truncation of order h^2 = 1e-10, cancellation of order 1e-11/h = 1e-6 at worst.
         np.testing.assert_allclose(forward[i], slope, rtol=1e-6)
         np.testing.assert_allclose(backward[i], forward[i], rtol=1e-9)

@@ -6,6 +6,7 @@
 import dataclasses
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -161,15 +162,16 @@ law = jg.NeighboringOptimal(gains, scale=0.6)
 mission = jg.Mission(DoubleIntegrator(), law, (0.0, 0.0), 0.1)
 {work}
 """
-INTO = "jg.sweep(mission, DISPERSIONS, 4000, 7, tile=TILE, chunk=64, store=store, resume=True)"
+INTO = "jg.sweep(mission, DISPERSIONS, 768, 7, tile=TILE, chunk=64, store=store, resume=True)"
 
 
 def child(tmp_path, work):
     """A process that makes the mission ready and does `work`."""
     code = CHILD.format(tests=str(Path(__file__).parent), work=work)
-    env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
+    kept |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, env=env, text=True
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, env=os.environ | kept, text=True
     )
 
 
@@ -179,25 +181,35 @@ def files(store):
 
 @pytest.mark.slow
 def test_killed_at_any_instant(tmp_path):
-    """kill -9 at 20 random instants, then once more to the end: 20 stores of 20 are the whole's."""
-    stores = [str(tmp_path / f"store{i}") for i in range(20)]
-    whole = tmp_path / "whole"
-    assert child(tmp_path, f"store = {str(whole)!r}; {INTO}").wait() == 0
-    chunks = len(list((whole / "partial" / "digest" / "c").iterdir()))
-    places = random.Random(0)
-    for store in stores:
-        running = child(tmp_path, f"store = {store!r}; {INTO}")
-        digests, first = Path(store) / "partial" / "digest" / "c", places.randrange(chunks - 5)
+    """What kill -9 leaves at 20 random instants, flown to the end: 20 stores of 20 are the whole's.
+
+    A process that is stopped has on disk what it would leave if it were killed there: one process
+    is stopped at each instant and its files are copied, and at the last it is killed."""
+    whole, flown = tmp_path / "whole", tmp_path / "flown"
+    running = child(tmp_path, "\n".join(f"store = {str(s)!r}; {INTO}" for s in (whole, flown)))
+    places, chunks = random.Random(0), 12
+    digests = flown / "partial" / "digest" / "c"
+    stores = [flown]
+    for first in sorted(places.randrange(chunks - 1) for _ in range(20)):
         while running.poll() is None and not (digests / str(first) / "0").exists():
             time.sleep(1e-3)
-        time.sleep(places.uniform(0.0, 0.03))  # a chunk takes some 0.02 s
-        running.send_signal(signal.SIGKILL)
-        running.wait()
+        time.sleep(places.uniform(0.0, 0.05))  # a chunk takes some 0.1 s
+        running.send_signal(signal.SIGSTOP)
+        _, status = os.waitpid(running.pid, os.WUNTRACED)
+        assert os.WIFSTOPPED(status)  # before it ended
+        stores.append(tmp_path / f"store{len(stores)}")
+        shutil.copytree(flown, stores[-1])
+        if len(stores) == 21:
+            running.send_signal(signal.SIGKILL)
+        running.send_signal(signal.SIGCONT)
+    assert running.wait() == -signal.SIGKILL
     want = files(whole)
-    assert sum(files(Path(store)) != want for store in stores) >= 15  # killed before they ended
-    assert child(tmp_path, f"for store in {stores}: {INTO}").wait() == 0
+    assert len(list((whole / "partial" / "digest" / "c").iterdir())) == chunks
+    left = [files(store) for store in stores]
+    assert want not in left and left[0] == left[20]
+    assert child(tmp_path, f"for store in {[str(s) for s in stores]}: {INTO}").wait() == 0
     for store in stores:
-        assert files(Path(store)) == want, store
+        assert files(store) == want, store
 
 
 @pytest.mark.slow
