@@ -7,13 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxguide.host.compilation import brisk_compilation
+from jaxguide.host.executables import kept
 from jaxguide.nominal.indirect.boundary import Unknowns
 from jaxguide.nominal.indirect.coarse import CONVERGED, damped_newton
 from jaxguide.nominal.indirect.guess import unknowns_of
 from jaxguide.nominal.indirect.laying import laid_mesh
 from jaxguide.nominal.indirect.shot import shot
 from jaxguide.nominal.indirect.starts import random_start
-from jaxguide.nominal.method import Capabilities, Method
+from jaxguide.nominal.method import Capabilities, Method, called
 from jaxguide.problem import Problem
 from jaxguide.trajectory import Extremal
 
@@ -75,6 +77,9 @@ class Shooting(Method):
         )
         return shot(problem, z, breaks, self.arcs, self.degree)
 
+    def run(self, problem: Problem, guess: Any) -> Extremal:
+        return shooting_program(self, problem, guess)
+
     @property
     def _arc_steps(self) -> int:
         return -(-self.coarse_steps // self.arcs)
@@ -99,3 +104,7 @@ class Shooting(Method):
         z = unknowns_of(problem, guess, self.arcs, self._arc_steps, dtype)
         better, left, _ = damped_newton(problem, z, self._arc_steps)
         return jax.tree_util.tree_map(lambda a, b: jnp.where(left < CONVERGED, a, b), better, z)
+
+
+shooting_program = kept(called, brisk_compilation)
+"""`Shooting` as one program, which compiles for longer than it runs in some twenty solves."""

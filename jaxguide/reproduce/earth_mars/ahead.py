@@ -13,9 +13,8 @@ import numpy as np
 
 from jaxguide.arrays import on_device
 from jaxguide.certificate import certified
-from jaxguide.host.compilation import compiled
 from jaxguide.neighboring.gains import gain_schedule
-from jaxguide.nominal.method import called
+from jaxguide.nominal.indirect.shooting import shooting_program
 from jaxguide.problem import with_typed_leaves
 from jaxguide.problems import earth_mars
 from jaxguide.problems.earth_mars import EarthMars
@@ -32,11 +31,10 @@ def compile_ahead(beside: Executor, times: np.ndarray, instants: np.ndarray, cas
     **Arguments:** as of what comes after: the schedule's times, the stages' `instants`, and the
     `cases` of the sweep.
     """
-    program = compiled(called, METHOD.quick)
     arguments = METHOD, with_typed_leaves(EarthMars()), None
-    if not program.is_kept(*arguments):
+    if not shooting_program.is_kept(*arguments):
         # Traced here: two threads that trace take turns at the interpreter.
-        like = program.eval_shape(*arguments)
+        like = shooting_program.eval_shape(*arguments)
         beside.submit(_run, _stand_in(like), times, instants, cases)
 
 
