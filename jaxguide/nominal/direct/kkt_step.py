@@ -25,9 +25,9 @@ from jaxguide.nominal.direct.trees import largest, zeros_like
 from jaxguide.nominal.direct.unknowns import Equations, Primal
 
 # Iterative refinement: at most `_REFINEMENTS` after the first solution, until the step leaves
-# `_ENOUGH` of the forces, some 1e4 roundings, and `_ENOUGH_RESIDUAL` of the residuals: a Newton
-# step that leaves a millionth of the constraints loses nothing. Chosen, not tuned.
-_REFINEMENTS, _ENOUGH, _ENOUGH_RESIDUAL = 2, 1e-12, 1e-6
+# `_ENOUGH` of the forces and of the residuals, some 1e4 roundings: the last step, and the only one
+# of a linear-quadratic problem, is then the solution to rounding. Chosen, not tuned.
+_REFINEMENTS, _ENOUGH = 2, 1e-12
 _LEAST_RESIDUAL = 1e-15  # rounding: residuals below it are zero
 
 
@@ -75,7 +75,7 @@ def newton_step(
     unheld = lambda given, force: xp.where(given, 0.0, force)
     load = load._replace(force=jax.tree_util.tree_map(unheld, system.given, load.force))
     enough_force = _ENOUGH * xp.maximum(1.0, largest(load.force))
-    enough_residual = _ENOUGH_RESIDUAL * largest(load.residual) + _LEAST_RESIDUAL
+    enough_residual = _ENOUGH * largest(load.residual) + _LEAST_RESIDUAL
 
     def refine(carry: tuple) -> tuple:
         count, step, left, _ = carry
