@@ -51,11 +51,11 @@ def kept(
 ) -> "Kept":
     """`function` as by `eqx.filter_jit`, its programs kept between processes.
 
-    It is traced once in each process; whether its program is known already is told by the program's
-    own text, the machine, the versions and the options. Under a trace it is the jitted function,
-    and so it is where nothing may be kept: with an empty `JAXGUIDE_CACHE_DIR`, with a compilation
-    cache of JAX's own (an executable that JAX has loaded cannot be kept again), on several devices,
-    and for programs that call back into Python.
+    A program of another process is found by what decides it, without a trace (`fingerprint`), or
+    where that is not told by its own text; and by the machine, the versions and the options.
+    Nothing is kept with an empty `JAXGUIDE_CACHE_DIR`, and with a compilation cache of JAX's own:
+    an executable that JAX has loaded cannot be kept again. Under a trace it is the jitted function,
+    and so it is on several devices, and for programs that call back into Python.
 
     **Arguments:** `function`: pure, without arrays of its own (a function of a module); `options`:
     gives XLA's options when they are first needed, such as `quick_compilation`.
@@ -123,7 +123,7 @@ class Kept:
     def is_kept(self, *args: Any, **kwargs: Any) -> bool:
         """Whether an earlier process kept the program for these arguments, told without a trace."""
         given = _given(args, kwargs)
-        if given is None or _stands_aside(given[0]):
+        if given is None or _stands_aside(given[0]) or not _keeps():
             return False
         known = _told_key(self, (args, kwargs))
         return known is not None and cache.read(known) is not None
@@ -227,7 +227,8 @@ class _Program:
 def _made(of: Kept, arrays: list[Any], static: _Static, arguments: tuple) -> tuple[Any, Any]:
     """The program loaded and what it gave for `arrays`, or else compiled and kept, and None; two
     None if it calls back into Python."""
-    known = _told_key(of, arguments)
+    keeps = _keeps()
+    known = _told_key(of, arguments) if keeps else None
     if known is not None and (found := _found(known, None, arrays)) is not None:
         return found
     flat, options = of._flat, of._options
@@ -237,6 +238,8 @@ def _made(of: Kept, arrays: list[Any], static: _Static, arguments: tuple) -> tup
     text = lowered.as_text()
     if _CALLBACK.search(text):
         return None, None
+    if not keeps:
+        return lowered.compile(), None
     structure = jax.tree_util.tree_unflatten(lowered.out_tree, [0] * lowered.out_tree.num_leaves)
     key, packed = known, _packed(structure)
     if key is None or packed is None:
@@ -337,14 +340,18 @@ def _settings() -> tuple:
     return tuple(getattr(jax.config, name, None) for name in _SETTINGS)
 
 
+def _keeps() -> bool:
+    """Whether programs are kept: see `kept`."""
+    config: Any = jax.config
+    own = config.jax_compilation_cache_dir and config.jax_enable_compilation_cache
+    return cache.folder() is not None and not own
+
+
 def _stands_aside(arrays: list[Any]) -> bool:
     """Whether JAX's own ways are to be taken: see `kept`."""
-    config: Any = jax.config
     devices = jax.devices()
     return (
-        cache.folder() is None
-        or bool(config.jax_compilation_cache_dir and config.jax_enable_compilation_cache)
-        or any(getattr(config, name) for name in _CHECKS)
+        any(getattr(jax.config, name) for name in _CHECKS)
         or len(devices) > 1
         # Beside an accelerator arrays may lie on the host.
         or (devices[0].platform != "cpu" and any(_elsewhere(a, devices[0]) for a in arrays))

@@ -155,12 +155,7 @@ def validate(problem: Problem) -> None:
         return
     for name, size in sizes.items():
         _check_bounds(problem, name, size)
-    typed = with_typed_leaves(problem)
-    start = _start(typed)
-    if is_traced(start):  # within a trace of something else
-        with jax.ensure_compile_time_eval():
-            start = _start(typed)
-    t0, tf, x0, u0, rate = jax.device_get(start)
+    t0, tf, x0, u0, rate = jax.device_get(_start(with_typed_leaves(problem)))
     _check_initial_values(problem, x0)
     _check_horizon(problem, float(t0), float(tf))
     if not np.all(np.isfinite(rate)) and not any(initially_free(problem)):
