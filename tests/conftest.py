@@ -7,6 +7,7 @@ so tests perturb these (`dataclasses.replace` keeps the compiled program) and ma
 # pyright: reportAssignmentType=false
 
 import os
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -33,13 +34,22 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 import jaxguide as jg  # noqa: E402
+from jaxguide.nominal.direct import pseudospectral  # noqa: E402
 from jaxguide.problems.earth_mars import EarthMars  # noqa: E402
+
+# Iterations on the host take the longer the more tests share its cores, and compiling them instead
+# takes as much longer: they are left there, but by the tests of compiling them.
+pseudospectral._WORTH_COMPILING = 60.0
 
 
 def slow(*values):
     """Parameters of a case that the default run leaves to the slow one."""
     return pytest.param(*values, marks=pytest.mark.slow)
 
+
+# For programs that run once or twice: as they are written they compile in two thirds of the time.
+AS_WRITTEN = {"xla_backend_optimization_level": 0}
+once = partial(jax.jit, compiler_options=AS_WRITTEN)
 
 # Few starts, one coarse mesh: enough for problems whose extremal is unique and smooth.
 SMALL = jg.Shooting(arcs=2, segments=8, starts=4)

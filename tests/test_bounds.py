@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime
+from conftest import DoubleIntegrator, FreeTime, once
 
 import jaxguide as jg
 
@@ -81,7 +81,7 @@ def test_derivatives_with_respect_to_bounds_of_every_kind():
         e = solved(v)
         return e.objective, e
 
-    (cost, e), slopes = jax.jit(jax.value_and_grad(both, has_aux=True))(values)
+    (cost, e), slopes = once(jax.value_and_grad(both, has_aux=True))(values)
     wanted, wanted_slopes = jax.value_and_grad(lambda v: closed_form(*v))(values)
     # The optimiser's bounds have 1e-9 of room, by which slopes change as much times slope''/slope,
     # at most 22 (of the area).

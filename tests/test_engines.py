@@ -6,10 +6,9 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime, slow
+from conftest import DoubleIntegrator, FreeTime, once, slow
 from test_pseudospectral import Endless, HeldByPath
 
 import jaxguide as jg
@@ -48,7 +47,7 @@ def test_on_the_host_and_compiled(problem, method):
     problem = with_array_leaves(problem)
     start = problem.initial_state
     at = lambda x0: dataclasses.replace(problem, initial_state=x0)
-    whole = jax.jit(lambda x0, g: jg.solve(at(x0), method, g, throw=False))
+    whole = once(lambda x0, g: jg.solve(at(x0), method, g, throw=False))
     host, traced = jg.solve(problem, method), whole(start, None)
     for a, b in ((host, traced), (jg.solve(problem, method, host), whole(start, host))):
         assert bool(a.result == b.result)

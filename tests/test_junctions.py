@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator
+from conftest import DoubleIntegrator, once
 
 import jaxguide as jg
 
@@ -189,7 +189,7 @@ def test_nothing_to_control_under_a_trace():
         def running_cost(self, t, x, u):
             return self.weight * super().running_cost(t, x, u)
 
-    value, slope = jax.jit(
+    value, slope = once(
         jax.value_and_grad(lambda w: jg.solve(Weighted(weight=w), method, throw=False).objective)
     )(1.0)
     # What four nodes leave between two points of the record.
@@ -304,7 +304,7 @@ def test_one_mesh_has_more_than_one_start():
 
 @pytest.mark.slow
 def test_a_trace_has_more_than_one_start():
-    again = jax.jit(lambda p: jg.solve(p, jg.Pseudospectral(), throw=False))
+    again = once(lambda p: jg.solve(p, jg.Pseudospectral(), throw=False))
     e = again(LeastTime(initial_state=(jnp.array(1.0), jnp.array(0.5))))
     np.testing.assert_allclose(e.objective, LEAST_TIME, rtol=1e-3)
     assert e.result == jg.RESULTS.underresolved

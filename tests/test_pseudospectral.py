@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime, slow
+from conftest import DoubleIntegrator, FreeTime, once, slow
 from jax.flatten_util import ravel_pytree
 
 import jaxguide as jg
@@ -194,7 +194,7 @@ def test_earth_mars_against_shooting(earth_mars):
     again = jg.solve(EarthMars(), method, guess=earth_mars)
     np.testing.assert_allclose(again.objective, e.objective, rtol=1e-9)
     objective = lambda k: jg.solve(dataclasses.replace(EarthMars(), thrust=k), method).objective
-    lanes, slopes = jax.jit(jax.vmap(jax.value_and_grad(objective)))(jnp.array([0.1405, 0.141]))
+    lanes, slopes = once(jax.vmap(jax.value_and_grad(objective)))(jnp.array([0.1405, 0.141]))
     np.testing.assert_allclose(lanes[0], e.objective, rtol=1e-9)
     # reference/earth_mars.json; the mesh leaves 1e-8 of it.
     np.testing.assert_allclose(slopes[0], -3.5434202430, rtol=1e-7)
@@ -252,7 +252,7 @@ def test_implicit_derivatives_with_an_active_bound():
 
     at, h = (1.5, 3.0, 10.0), 1e-5
 
-    @jax.jit
+    @once
     def both(*at):
         _, push = jax.linearize(landing, *at)  # one solve for both ways
         pull = jax.linear_transpose(push, *at)

@@ -19,6 +19,7 @@ from conftest import (
     FreeTime,
     Regulator,
     at,
+    once,
     slow,
     zermelo_to_go,
 )
@@ -223,7 +224,7 @@ def batch(of_thrust):
 def test_thrust_derivatives_both_ways(of_thrust, batch):
     k = jnp.asarray(0.1405)
 
-    @jax.jit
+    @once
     def both(k):
         value, pull = jax.vjp(lambda k: of_thrust(k)[:2], k)
         tangents = jax.jvp(lambda k: of_thrust(k)[:2], (k,), (jnp.ones_like(k),))[1]
@@ -400,7 +401,7 @@ def test_a_failure_in_a_batch_spoils_only_its_own_gradient(earth_mars):
 
     thrust = EarthMars().thrust
     batch = jnp.array([thrust, jnp.nan, 0.0, thrust])  # without thrust the end is out of reach
-    slope = jax.jit(jax.vmap(jax.grad(radius)))(batch)
+    slope = once(jax.vmap(jax.grad(radius)))(batch)
     # The reference is a finite difference, good to some 1e-9.
     np.testing.assert_allclose(slope[::3], D_RADIUS_D_THRUST, rtol=1e-8)
     assert np.all(np.isnan(slope[1:3]))
@@ -409,7 +410,7 @@ def test_a_failure_in_a_batch_spoils_only_its_own_gradient(earth_mars):
 @pytest.mark.slow
 def test_not_minimising_is_told_apart(earth_mars):
     e, size = earth_mars, earth_mars.sizes()
-    judge = lambda u: judged(dataclasses.replace(e, u=u), size, e.residual)
+    judge = once(lambda u: judged(dataclasses.replace(e, u=u), size, e.residual))
     assert bool(judge(e.u) == jg.RESULTS.successful)
     assert bool(judge(e.u + jnp.pi) == jg.RESULTS.not_minimising)  # H maximised
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import DoubleIntegrator, FreeTime, at
+from conftest import DoubleIntegrator, FreeTime, at, once
 
 import jaxguide as jg
 from jaxguide import reproduce
@@ -73,7 +73,7 @@ def test_implicit_derivatives_and_batches():
     method = jg.PiecewiseLinear(3, 4, starts=1)
     cost = lambda k: jg.solve(DoubleIntegrator(k=k), method, throw=False).objective
     ks = jnp.array([1.0, 1.5])
-    J, slope = jax.jit(jax.vmap(jax.value_and_grad(cost)))(ks)
+    J, slope = once(jax.vmap(jax.value_and_grad(cost)))(ks)
     np.testing.assert_allclose(J, 6 / ks**2, rtol=1e-12)
     np.testing.assert_allclose(slope, -12 / ks**3, rtol=1e-11)
 
@@ -87,7 +87,7 @@ def test_nodes_are_differentiable(launch):
         method = jg.PiecewiseLinear(even.at[2].set(s), 4)
         return jg.solve(LunarLaunch(), method, launch, throw=False).u[::4, 0]
 
-    both = jax.jit(lambda s: jax.jvp(controls, (s,), (jnp.ones(()),)))
+    both = once(lambda s: jax.jvp(controls, (s,), (jnp.ones(()),)))
     _, slope = both(even[2])
     h = 1e-4  # truncation of order h^2 = 1e-8, rounding 1e-14/h = 1e-10
     fd = (both(even[2] + h)[0] - both(even[2] - h)[0]) / (2 * h)
@@ -108,7 +108,7 @@ def test_gains_of_the_double_integrator(integrator):
     np.testing.assert_allclose(schedule.here[:, 0], here, rtol=1e-10)
     end = np.stack([6 / T**2, 2 / T], axis=1)
     np.testing.assert_allclose(schedule.K[:, -1, 0], end, rtol=1e-9)
-    Phi = sensitivities(integrator, jnp.asarray(stations)).Phi  # dx = Phi dx_f + Psi da
+    Phi = once(sensitivities)(integrator, jnp.asarray(stations)).Phi  # dx = Phi dx_f + Psi da
     want = np.broadcast_to(np.eye(2), (5, 2, 2)).copy()
     want[:, 0, 1] = -T
     np.testing.assert_allclose(Phi, want, rtol=0, atol=1e-13)
