@@ -103,6 +103,17 @@ def test_what_changes_a_program_changes_its_digest(change):
     assert (digest(MODULE) == digest(MODULE.replace(old, new))) == (change == "a class")
 
 
+def test_functions_that_change_within_a_process_are_untold():
+    """JAX keeps traces of parts with the old number: a program of both would be kept."""
+    names = module(MODULE)
+    told(KNOWN, names["problem"])
+    names["DRAG"] = 0.2
+    with pytest.raises(Untold):
+        told(KNOWN, names["problem"])
+    names["DRAG"] = 0.1
+    told(KNOWN, names["problem"])
+
+
 def test_numbers_that_a_program_takes_do_not():
     a, b = (module(MODULE.replace("jnp.asarray(1.0)", f"jnp.asarray({v})")) for v in (1.0, 2.0))
     same = [told(KNOWN, (m["problem"], np.full(3, k))) for k, m in enumerate((a, b))]

@@ -46,10 +46,20 @@ def told(function: Callable, arguments: Any) -> str:
     return writer.digest()
 
 
+def constants(value: Any) -> str:
+    """A digest of `value` in which arrays count by their numbers.
+
+    **Raises:** `Untold`.
+    """
+    writer = _Writer()
+    writer._as_constants([value])
+    return writer.digest()
+
+
 @functools.singledispatch
 def foreign(value: Any) -> Any:
-    """What a Module of an unknown class stands for: a tree of values, of which a Jaxpr tells what
-    the functions are. To be registered for each kind of class that users write.
+    """What a Module of an unknown class stands for: values that tell what its functions do, such as
+    a digest of their Jaxpr. To be registered for each kind of class that users write.
 
     **Raises:** `Untold`.
     """

@@ -1,7 +1,6 @@
 """What a Problem of the user's is to the programs that call it: its data and its functions, traced
 at one point."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxguide.host.fingerprint import Untold, foreign
+from jaxguide.host.fingerprint import Untold, constants, foreign
 from jaxguide.problem.parameters import with_parameters
 from jaxguide.problem.statement import Problem
 
@@ -23,16 +22,25 @@ _ALONG = ("dynamics", "running_cost", "path_constraints", "integrands")
 _AT_ENDS = ("endpoint_cost", "endpoint_constraints")
 
 
+# What Problems of each kind were first. Where that changes within a process, as by a global number,
+# JAX still holds traces of parts with the old one, and no program is what its Problem says.
+_first: dict[Any, str] = {}
+
+
 @foreign.register(Problem)
-def _told(problem: Problem) -> Any:
+def _told(problem: Problem) -> str:
     leaves, structure = jax.tree_util.tree_flatten(problem)
     try:
-        return _traced(structure, tuple(map(jax.typeof, leaves)))
+        types = tuple(map(jax.typeof, leaves))
+        now = constants(_traced(structure, types))
+        same = _first.setdefault((structure, types), now) == now
     except Exception as error:  # the user's functions may raise anything, and static fields too
         raise Untold(problem) from error
+    if not same:
+        raise Untold(problem)
+    return now
 
 
-@functools.lru_cache(256)
 def _traced(structure: Any, types: tuple[Any, ...]) -> Any:
     """The data and the functions of Problems of one kind, as a Jaxpr of their leaves and what it
     leaves out."""
